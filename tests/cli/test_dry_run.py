@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from cli.harness import SMALL, Run, assert_refused, listing, scene_arguments
+from cli.harness import SMALL, Run, listing, scene_arguments
 
 
 def test_dry_run(keyss: Run, workspace: Path, tmp_path: Path) -> None:
@@ -21,7 +21,3 @@ def test_dry_run(keyss: Run, workspace: Path, tmp_path: Path) -> None:
     assert result.status == 0
     assert "--publish any has room" in result.err  # too few for low bits
     assert listing(tmp_path) == {}
-    result = keyss(
-        "hide", *scenes, "--format", "ply", "-o", tmp_path / "out", *SMALL, "--sh-degree", 0, "--dry-run"
-    )
-    assert_refused(result, 2, "--sh-degree 1 makes room")  # 0 is a degree, not a default

@@ -136,7 +136,7 @@ class TestUnexpectedErrors:
     @pytest.fixture
     def fail_info(self, monkeypatch: pytest.MonkeyPatch) -> Callable[[BaseException], None]:
         def fail_with(error: BaseException) -> None:
-            def info(path: Path) -> None:
+            def info(path: Path, *, capacity: bool) -> None:
                 raise error
 
             monkeypatch.setattr("keyss.runs.describe.info", info)

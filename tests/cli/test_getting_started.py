@@ -43,11 +43,8 @@ def test_cover_without_harmonics(keyss: Run) -> None:
     assert shown.status == 0, shown.err
     assert "whoever inspects the published file sees that it holds something" in shown.err.splitlines()[0]
     refused = keyss(*flat, "--secret", "small.ply", "--format", "ply", "-o", "run")
-    assert refused.status == 2
-    assert "--sh-degree 1 makes room" in refused.err
-    done = keyss(*flat, "--secret", "small.ply", "--sh-degree", "1", "--iterations", "5", "-o", "run")
-    assert done.status == 0, done.err
-    assert "The secret kept" not in done.out
+    assert refused.status == 7  # few low bits, for a few Gaussians of the secret
+    assert "--publish any keeps all of them" in refused.err
 
 
 def test_hide_from_few_photos(keyss: Run, workspace: Path) -> None:

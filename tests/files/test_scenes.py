@@ -5,8 +5,10 @@ from __future__ import annotations
 import struct
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import psutil
 import pytest
 import torch
 from PIL import Image
@@ -187,3 +189,14 @@ def test_image_decompression_bombs(tmp_path: Path, side: int, limit: str) -> Non
     (folder / "images" / "01.png").write_bytes(png)
     with pytest.raises(InputError, match=rf"01\.png: expected an image of at most {limit},000,000 pixels"):
         load_scene(folder)
+
+
+def test_photos_that_exceed_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_colmap(tmp_path, 10)
+    pixels = 10 * WIDTH * HEIGHT * 3  # bytes
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=pixels - 1))
+    with pytest.raises(InputError, match=rf"10 photos take .*`width={int(WIDTH * 0.5**0.5)}`"):
+        load_scene(tmp_path)
+    assert load_scene(tmp_path, width=int(WIDTH * 0.5**0.5)).train
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=pixels))
+    assert load_scene(tmp_path).train

@@ -113,6 +113,8 @@ test('a secret put into another file is told', async () => {
     expect(digest(found!.data)).toBe(wanted.payload);
     expect(found!.foreign).toBeGreaterThan(100);
   }
+  const faint = { ...speck, opacityLogits: speck.opacityLogits.map(() => Math.log(1.5 / 253.5)) };
+  expect(digest((await AppendedReader.of(together(model, faint))!.open(wanted.key, derive))!.data)).toBe(wanted.payload);
   for (const kept of [model, together(appended, some(cover, 0.3, 4))]) {
     expect((await AppendedReader.of(kept)!.open(wanted.key, derive))!.foreign).toBeUndefined();
   }

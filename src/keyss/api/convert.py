@@ -15,7 +15,7 @@ from keyss.files.atomic import mode_like, write_bytes
 from keyss.files.file_kinds import model_file
 from keyss.files.formats.ply import with_extras
 from keyss.files.inputs import is_standard, write_standard_output
-from keyss.files.models import check_model_output, keeps_low_bits, model_bytes, model_of_bytes
+from keyss.files.models import check_model_output, holds, keeps_low_bits, model_bytes, model_of_bytes
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_visible, psnr_between
 from keyss.runs.files import PathLike, as_model
@@ -76,7 +76,7 @@ def convert(
     before = as_model(model if source is None else source)
     opened = [reveal_any(before, key, target) for key in keys]
     data = model_bytes(path, with_extras(before, source, before))
-    after = model_of_bytes(path, data)
+    after = before if holds(path, data, before) else model_of_bytes(path, data)  # a copy takes memory
     secrets = tuple(
         KeptSecret(each.remains.found, _size_left(after, key, target), "bytes" if each.file else "Gaussians")
         for key, each in zip(keys, opened, strict=True)

@@ -17,11 +17,14 @@ from keyss.files.atomic import check_not_an_input, check_output_file, write_byte
 from keyss.files.images import animation_bytes, png_bytes
 from keyss.measure.hide_quality import WRONG_KEYS, compare, measure_hiding
 from keyss.measure.renders import renders_of
+from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import checked_size, turntable
-from keyss.runs.files import METRICS, Background, PathLike, as_model, as_scene
+from keyss.runs.estimates import seconds_for
+from keyss.runs.files import METRICS, Background, PathLike, as_model, as_scene, stego_in
 from keyss.runs.folder import RunFolder, write_again
 from keyss.runs.open_run import open_run
+from keyss.runs.planning import view_seconds
 from keyss.runs.run_records import HideMetrics
 
 Split = Literal["test", "train", "all"]
@@ -80,6 +83,7 @@ def evaluate(
     *,
     wrong_keys: int | None = None,
     device: Backend = "auto",
+    reporter: Reporter | None = None,
 ) -> HideMetrics:
     """Measure a run of `hide` again on the test views; rewrites its `metrics.json`.
 
@@ -87,27 +91,37 @@ def evaluate(
     only for methods whose keys condition a decoder. Raises WrongKeyError for a key that opens nothing,
     UsageError for a secret without a key.
     """
-    target = resolve_device(device)
-    opened = open_run(run, keys)
+    target, reporter = resolve_device(device), reporter or Reporter()
+    with reporter.waiting("opening the secrets", len(keys) * seconds_for("reveal", stego_in(Path(run)))):
+        opened = open_run(run, keys)
     if wrong_keys is not None and all(each.decode is None for each in opened.opened):
         raise UsageError(
             f"the method {opened.config.method} has no decoder, so wrong keys show nothing: leave out "
             "`wrong_keys`"
         )
-    stego, scenes = opened.stego.to(target), opened.scenes(train_pictures=False)
-    models = [stego, *(secret.reveal(stego).to(target) for secret in opened.opened)]
-    baselines = [None if model is None else model.to(target) for model in opened.baselines()]
-    measured = measure_hiding(
-        stego,
-        opened.opened,
-        scenes,
-        list(map(compare, models, baselines, scenes)),
-        gaussians=[None if model is None else len(model) for model in baselines],
-        steps=opened.metrics.baseline.steps,
-        equal=opened.metrics.baseline.equal,
-        wrong_keys=WRONG_KEYS if wrong_keys is None else wrong_keys,
-        seed=opened.metrics.seed,
+    stego = opened.stego.to(target)
+    with reporter.waiting("reading the scenes", seconds_for("prepare", stego_in(opened.folder))):
+        scenes = opened.scenes(train_pictures=False)
+        models = [stego, *(secret.reveal(stego).to(target) for secret in opened.opened)]
+        baselines = [None if model is None else model.to(target) for model in opened.baselines()]
+    tries = WRONG_KEYS if wrong_keys is None else wrong_keys
+    decoded = tries * sum(each.decode is not None for each in opened.opened)
+    seconds = sum(
+        (1 + decoded) * len(scene.test) * view_seconds(target.type, len(model), scene)
+        for model, scene in zip(models, scenes, strict=True)
     )
+    with reporter.waiting("comparing renders", seconds):
+        measured = measure_hiding(
+            stego,
+            opened.opened,
+            scenes,
+            list(map(compare, models, baselines, scenes)),
+            gaussians=[None if model is None else len(model) for model in baselines],
+            steps=opened.metrics.baseline.steps,
+            equal=opened.metrics.baseline.equal,
+            wrong_keys=tries,
+            seed=opened.metrics.seed,
+        )
     metrics = replace(opened.metrics, **vars(measured))
     write_again(opened.folder, "hide", METRICS, metrics)
     return metrics

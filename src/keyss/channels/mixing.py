@@ -9,6 +9,8 @@ bits if the filter holds B Gaussians. Equal IDs count once.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.algorithms import AES
@@ -76,13 +78,13 @@ def foreign_share(secret: bytes, ids: Bytes, own: bytes, among: Integers | int, 
     """Estimated share, 0 to 1, of foreign Gaussians among those with `ids` [M, 16], by the sketch `own`.
 
     `among` [M]: as in `sketch`, if Gaussians count in inverse proportion to it; else the number of its
-    Gaussians. 1 if less than a share `gone` of the sketch's sample is there.
+    Gaussians. 1 if less than a share `gone` of the sketch's sample, rounded down, is there.
     """
     unset = np.unpackbits(np.frombuffer(own, np.uint8), bitorder="little") == 0
     places = _places(secret, ids, among, len(unset))
     if isinstance(among, int):
         unset = unset[:among]
-    if len(places) < gone * (~unset).sum():
+    if len(places) < math.floor(gone * (~unset).sum()):
         return 1.0
     return min(1.0, float(unset[places].sum() / max(1e-9, len(places) * unset.mean())))
 

@@ -29,6 +29,7 @@ from keyss.cli.arguments import (
     switch,
 )
 from keyss.cli.keys import keys
+from keyss.cli.verbs import verb
 from keyss.core.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -133,11 +134,12 @@ def hide(args: HideArguments) -> None:
     """
     check_exists(args.cover, args.details.cover_model)
     check_exists(*args.secret, *args.secret_file, *args.key_file, *args.details.secret_model)
-    options = _method_options(args)
     if args.secret_file:
+        _method_options(args)  # refuses wrong ones
         _hide_files(args)
     elif args.secret:
-        _hide_scenes(args, options)
+        verb("hide")
+        _hide_scenes(args, _method_options(args))
     else:
         raise UsageError("no secret: give --secret SCENE or --secret-file FILE, one for each secret")
 

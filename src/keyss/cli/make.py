@@ -24,6 +24,7 @@ from keyss.cli.arguments import (
     switch,
 )
 from keyss.cli.keys import given_keys, key_of_file
+from keyss.cli.verbs import verb
 from keyss.core.errors import UsageError
 
 ENOUGH_BITS = 64  # of a random key, which Argon2id makes as slow to find as 2^80 plain hashes
@@ -84,16 +85,17 @@ def fit(
     check_exists(scene)
     from dataclasses import replace
 
-    import keyss
     from keyss import progress
     from keyss.cli.tables import print_files, print_fit
+
+    run = verb("fit")
     from keyss.fitting.config import preset_for
     from keyss.rendering import resolve_device
     from keyss.runs.files import METRICS
     from keyss.runs.json_records import read_record
     from keyss.runs.run_records import FitMetrics
 
-    keyss.fit(
+    run(
         scene,
         config=replace(preset_for(preset, resolve_device(device).type), **training.schedule()),
         **vars(photos),

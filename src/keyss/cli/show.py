@@ -20,6 +20,7 @@ from keyss.cli.arguments import (
     switch,
 )
 from keyss.cli.keys import keys_of_run
+from keyss.cli.verbs import verb
 from keyss.core.errors import UsageError
 
 _VECTOR = r"[-+.\de]+(,[-+.\de]+){2}"
@@ -69,20 +70,18 @@ def view(
     from keyss.cli.tables import print_written
     from keyss.progress import waiting
     from keyss.runs.estimates import seconds_for
-    from keyss.viewer import ModelServer, export_html, look_of_model
 
     if pose and not re.fullmatch(_POSE, pose):
         raise UsageError(f"--pose: expected eye=X,Y,Z&target=X,Y,Z as in the page's address, got {pose}")
     given = {"pose": pose, "up": up, "title": title, "host": allow_host, "embedder": embed_in}
-    look = look_of_model(model)
-    if up:
-        look.pop("pose", None)
-    look |= {name: value for name, value in given.items() if value}
+    changed = {name: value for name, value in given.items() if value}
     if out is not None:
         if port or host != "127.0.0.1":
             raise UsageError("--port and --host are for serving: leave them out with -o")
         with waiting(f"writing {out.name}", seconds_for("export", model)):
-            written = export_html(model, out, look=look, overwrite=overwrite)
+            from keyss.viewer import export_html
+
+            written = export_html(model, out, look=_look(model, changed), overwrite=overwrite)
         size = sum(path.stat().st_size for path in written) / 1e6
         what = "opens in any browser" if len(written) == 1 else f"{len(written)} files for a web server"
         print_written(out, f"{size:.1f} MB; {what}")
@@ -91,10 +90,23 @@ def view(
         raise UsageError("--overwrite, --allow-host and --embed-in are for -o: leave them out")
     if not 0 <= port < 1 << 16:
         raise UsageError(f"--port: expected 0 to {(1 << 16) - 1}, got {port}")
-    server = ModelServer(model, host, port, look)
+    with waiting(f"reading {model.name}", seconds_for("export", model)):
+        from keyss.viewer import ModelServer
+
+        server = ModelServer(model, host, port, _look(model, changed))
     who = "only on this machine" if server.is_local else f"to all who can reach {host} and know this address"
     print(f"{server.address} shows {model} {who}; press Ctrl-C to stop", flush=True)
     server.run()
+
+
+def _look(model: Path, changed: dict[str, str]) -> dict[str, str]:
+    """The look of a model's page with the values that are given."""
+    from keyss.viewer import look_of_model
+
+    look = look_of_model(model)
+    if "up" in changed:
+        look.pop("pose", None)
+    return look | changed
 
 
 def render(
@@ -177,12 +189,15 @@ def evaluate(
     example: keyss evaluate runs/hidden --key-file key.txt
     """
     check_exists(run)
-    import keyss
     from keyss import progress
     from keyss.cli.tables import print_files, print_hiding
+
+    measure = verb("evaluate")
     from keyss.fitting.image_metrics import HOW_TO_GET, MIN_SIZE
 
-    metrics = keyss.evaluate(run, keys_of_run(run, key_file), wrong_keys=wrong_keys, device=device)
+    metrics = measure(
+        run, keys_of_run(run, key_file), wrong_keys=wrong_keys, device=device, reporter=progress.reporter()
+    )
     if progress.level >= 0:
         print_hiding(metrics)
     if metrics.cover.lpips is None:

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from keyss.runs.run_records import FitMetrics, HideMetrics
 
 
-_UNCHANGED = 100.0  # dB; no pixel of 8 bits differs
 _HEADS = ("PSNR", "SSIM", "LPIPS", "bound", "loss", "start", "Gaussians", "plain", "steps")
 
 
@@ -204,7 +203,7 @@ def print_conversion(out: Path, found: Conversion, *, dry_run: bool) -> None:
         print(out, file=file)
         return
     was = "" if found.bytes_before is None else f", {_size(found.bytes_before)} before"
-    renders = "renders unchanged" if found.psnr >= _UNCHANGED else f"renders at {found.psnr:.1f} dB PSNR"
+    renders = "renders unchanged" if found.psnr >= 120 else f"renders at {found.psnr:.1f} dB PSNR"
     if math.isnan(found.psnr):
         renders = "renders are empty: the model is invisible"
     print(f"{out}: {len(found.gaussians):,} Gaussians, {_size(found.bytes_after)}{was}, {renders}", file=file)

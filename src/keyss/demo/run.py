@@ -27,6 +27,7 @@ OPTIONS = CarryOptions(fit=FitConfig(iterations=400, max_gaussians=10_000, evalu
 WRONG_KEYS = ("open sesame", "0000000000000000", "Demo-key")
 SECRET_PLY, WEB, COMPARISON, KEY, SCENES = "secret.ply", "web.spz", "comparison.png", "key.txt", "scenes"
 VIEWER = "index.html"
+_OPEN_SECONDS = 12.0  # of opening the published files and comparing their pictures
 
 
 @dataclass(frozen=True)
@@ -74,9 +75,10 @@ def run_demo(
             out=out,
             reporter=reporter,
         )
-        metrics = keyss.evaluate(out, [key], device=device)
+        reporter = reporter or Reporter()
+        metrics = keyss.evaluate(out, [key], device=device, reporter=reporter)
         results = RunFolder(out, "demo", onto=("scenes", "hide"))
-        with results.work():
+        with results.work(), reporter.waiting("opening it again, with right and wrong keys", _OPEN_SECONDS):
             revealed = keyss.reveal(out / STEGO, key, device=device).gaussians
             refused = sum(_is_refused(out / STEGO, wrong, device) for wrong in WRONG_KEYS)
             there = results.write({WEB: _hide_for_web(out, cover, secret, key, device)})

@@ -128,6 +128,12 @@ def reads_as(path: Path, model: Gaussians) -> bool:
         return ply.holds(file, model)
 
 
+def holds(path: Path | str, data: bytes, model: Gaussians) -> bool:
+    """`reads_as` for a file at `path` that contains `data`."""
+    exact = type(model) is Gaussians and keeps_low_bits(path)
+    return exact and ply.holds(io.BytesIO(data), model)
+
+
 def model_of_bytes(path: Path | str, data: bytes) -> Gaussians:
     """`read_model` for a file at `path` that contains `data`."""
     try:

@@ -23,6 +23,7 @@ from keyss.files.images import downscale, is_rotated_by_exif, probe_image, read_
 from keyss.files.lens import Lens, Undistortion, undistortion
 from keyss.files.scene_layout import Photo, SceneLayout, leave_out
 from keyss.files.transforms import read_blender, read_nerfstudio
+from keyss.kernels.memory import available_memory
 
 _ROUNDING = 1e-12  # relative error of a camera's position
 _FAR = 1000  # extents from the origin, where single precision resolves 1e-4 extents
@@ -62,7 +63,8 @@ def load_scene(
     KeyssWarning: see `View.mask`. So are resampled pixels that overlap a masked one.
 
     Raises InputError for an unknown layout, broken or truncated files, missing or undecodable images, images
-    whose aspect differs from their camera's by more than a pixel, or a scene without training or test images.
+    whose aspect differs from their camera's by more than a pixel, photos that exceed the free memory, or a
+    scene without training or test images.
     Raises UsageError for a `width` or `background` out of range.
     """
     if width is not None and width < 1:
@@ -94,6 +96,7 @@ def load_scene(
                 raise
             damaged.append(photo.name)
     sizes = [(width, height) for _, (width, height, _) in probed]
+    _check_memory(folder, sizes, width)
     photos = _fit_lenses(folder, [photo for photo, _ in probed], sizes)
     if behind is None:
         behind = torch.full((3,), float(any(transparent for _, (*_, transparent) in probed)))
@@ -129,6 +132,19 @@ def load_scene(
         background=behind,
         origin=torch.from_numpy(origin),
     )
+
+
+def _check_memory(folder: Path, sizes: Sequence[tuple[int, int]], width: int | None) -> None:
+    """Raise InputError if photos of these widths and heights, shrunk to `width`, do not fit into memory."""
+    shrunk = [min(1.0, (width or columns) / columns) for columns, _ in sizes]
+    needed = sum(3 * w * h * share**2 for (w, h), share in zip(sizes, shrunk, strict=True))
+    if needed > (available := available_memory()):
+        widest = max(w * share for (w, _), share in zip(sizes, shrunk, strict=True))
+        half = max(1, int(widest * (available / needed / 2) ** 0.5))
+        raise InputError(
+            f"{folder}: the pixels of {len(sizes):,} photos take {needed / 1e9:.1f} GB of memory, and "
+            f"{available / 1e9:.1f} GB are free; `width={half}` takes half of that"
+        )
 
 
 def origin_and_extent(viewmats: Sequence[Doubles]) -> tuple[Doubles, float]:

@@ -134,5 +134,7 @@ class CombinedStrategy(CappedStrategy):
         # gsplat compares one number for each Gaussian with its threshold.
         state["grad2d"], state["count"] = growing * 2 * self.grow_grad2d, torch.ones_like(gradients[:, 0])
         grown: tuple[int, int] = DefaultStrategy._grow_gs(self, params, optimizers, state, step)
-        state["grad2d"] = state["count"] = gradients.new_zeros(len(params["means"]), scenes)
+        # Two tensors: checkpoints refuse one under two names.
+        for name in ("grad2d", "count"):
+            state[name] = gradients.new_zeros(len(params["means"]), scenes)
         return grown

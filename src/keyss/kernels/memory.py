@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import torch
 
 Array = np.ndarray[Any, Any]
@@ -47,6 +49,17 @@ def empty(shape: tuple[int, ...], dtype: Any) -> Array:
 def release() -> None:
     """Give all unused buffers back to the system; large models need hundreds of megabytes."""
     _free.clear()
+
+
+def available_memory() -> int:
+    """Bytes available on the machine and in its container (Linux, cgroup 2)."""
+    available: int = psutil.virtual_memory().available
+    with suppress(OSError, ValueError, KeyError):  # "max" without a limit
+        group = Path("/sys/fs/cgroup")
+        limit, used = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
+        cached = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        available = min(available, limit - used + int(cached["inactive_file"]))
+    return available
 
 
 def _buffer(size: int) -> Array:

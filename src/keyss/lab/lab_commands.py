@@ -23,6 +23,7 @@ from keyss.cli.arguments import (
     optional,
     switch,
 )
+from keyss.cli.verbs import verb
 
 if TYPE_CHECKING:
     from keyss.lab.audits import Audit
@@ -65,15 +66,15 @@ def audit(
     example: keyss audit runs/hidden --dry-run
     """
     check_exists(run)
+    measure = verb("audit")
     if dry_run:
         _print_audit_forecast(run, controls, only, device)
         return
-    import keyss
     from keyss import progress
     from keyss.cli.keys import keys_of_run
     from keyss.cli.tables import print_files
 
-    found = keyss.audit(
+    found = measure(
         run,
         () if report_only else keys_of_run(run, key_file),
         report_only=report_only,
@@ -121,7 +122,7 @@ def compare(
     example: keyss compare --cover SCENE_A --secret SCENE_B --quick -o runs/compared
     """
     check_exists(cover, secret)
-    import keyss
+    run = verb("compare")
     from keyss import progress
     from keyss.cli.tables import print_files, print_table
     from keyss.core.errors import InputError
@@ -131,7 +132,7 @@ def compare(
     given = {"iterations": iterations, "max_gaussians": max_gaussians, "width": width}
     budget = {name: QUICK[name] if value is None and quick else value for name, value in given.items()}
     named = [] if methods.strip() == "all" else [name.strip() for name in methods.split(",")]
-    comparison = keyss.compare(
+    comparison = run(
         cover,
         secret,
         methods=named,
@@ -204,14 +205,14 @@ def reproduce(
 
     example: keyss reproduce multi 360/* --full -o runs/paper-full
     """
-    import keyss
+    run = verb("reproduce")
     from keyss import progress
     from keyss.cli.tables import print_files, print_table
     from keyss.core.errors import InputError
     from keyss.lab.many import Forecast
     from keyss.lab.many.reproduction import reproduction_notes, reproduction_rows
 
-    reproduction = keyss.reproduce(
+    reproduction = run(
         table,
         scenes,
         full=full,
@@ -263,13 +264,13 @@ def sweep(
 
     example: keyss sweep sweep.yaml -o runs/sweep --dry-run
     """
-    import keyss
+    run = verb("sweep")
     from keyss import progress
     from keyss.cli.tables import print_files
     from keyss.core.errors import InputError
     from keyss.lab.many import Forecast
 
-    outcomes = keyss.sweep(spec, out, ray=ray, cores=cores, dry_run=dry_run, reporter=progress.reporter())
+    outcomes = run(spec, out, ray=ray, cores=cores, dry_run=dry_run, reporter=progress.reporter())
     if isinstance(outcomes, Forecast):
         _print_forecast(outcomes)
         return

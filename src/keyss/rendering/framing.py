@@ -21,17 +21,15 @@ _LEAST = 0.08  # share of the weight in the smallest sphere
 # A sphere's weight by this power of its radius: between that of lines, 1, and of clutter around a subject.
 _GROWTH = 0.8
 _OUTLIERS = 0.995  # share of the weight of a model without surroundings that its sphere holds
-_COARSER = (
-    1.6  # ratio of the sizes of Gaussians outside and inside, above which those outside are surroundings
-)
+# Ratio of the sizes of Gaussians outside and inside, above which those outside are surroundings.
+_COARSER = 1.6
 _SLABS, _REACH = 40, 1.2  # slabs across 1.2 radii to both sides, which may hold a floor
 _ALIGNED = 0.85  # minimum cosine of a floor's normal with the direction across it
 _TILT, _STEP = 48.0, 5.0  # degrees from -y, as captures leave it; between directions at first
 _EXACT = 6.0  # degrees from the axes of other programs
 _TILTED_FLOOR, _AXIS_FLOOR = 0.07, 0.18  # share of the area in a floor
 _CLEARLY = 1.5  # ratio of the floor across an unusual direction to that across the usual one
-# Radii by which the middle of a model may be below a floor across an axis; from the second on, y is up.
-_HIGHEST, _BELOW = 0.3, 0.05
+_BELOW = 0.05  # radii by which the middle of a model is below a floor across y where y is up
 
 
 @dataclass(frozen=True)
@@ -96,7 +94,7 @@ def _up(offsets: Doubles, normals: Doubles, areas: Doubles) -> Doubles:
     """[3] the up direction; `offsets`: from the middle, in radii."""
     total = max(float(areas.sum()), 1e-30)
 
-    def largest(directions: Doubles, least_above: float = -_HIGHEST) -> tuple[float, float, Doubles]:
+    def largest(directions: Doubles, least_above: float = -math.inf) -> tuple[float, float, Doubles]:
         """The largest floor across one of the directions [D, 3].
 
         Its share of the area, how far in radii the model is above it on average, at least `least_above`, and

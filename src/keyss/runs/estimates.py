@@ -20,7 +20,7 @@ _START = 2.0  # seconds to import what the commands need
 _SECONDS = {
     "info": 0.3,
     "verify": 1.2,
-    "reveal": 3.0,
+    "reveal": 6.0,
     "hide a file": 10.0,
     "export": 1.0,
     "render": 10.0,

@@ -6,7 +6,6 @@ import os
 import shutil
 import warnings
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from keyss.core.errors import KeyssWarning, OutputError
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Targets
+from keyss.kernels.memory import available_memory
 from keyss.methods.method import MethodOptions, Source, seconds_to_hide
 from keyss.methods.plain_models import Bound
 from keyss.progress import about
@@ -27,6 +27,7 @@ _RENDERS = 2  # training steps that take as long as measuring a test view
 _CHECKPOINTS = 6  # two checkpoints / model: each holds parameters and two moments of Adam
 _MAX_APPENDED = 7  # Gaussians that hold one Gaussian of a secret of SH degree 3
 _COPIES = 2  # of what is published and of the secrets in memory, beside the given models
+_CHUNKS = 7  # copies of appended Gaussians: their chunks, coded, placed and read again
 _OTHER_BYTES = 4 << 20  # JSON files, locks, and the overhead of the file system
 
 
@@ -38,6 +39,7 @@ class Cost:
     seconds: float
     fit_seconds: tuple[float, ...]  # plain fits among them, the cover's first
     check_seconds: float  # reading the published file and measuring it
+    view_seconds: float  # measuring the cover and the secrets on one test view each
     device: str  # "cpu" or "cuda"
     disk_bytes: int  # at one time, checkpoints included
     memory_bytes: int
@@ -70,7 +72,7 @@ def cost_of(
     count, most = len(sources), options.fit.max_gaussians
     fits, trainings = options.fits(count), options.training(count)
     steps, trained, sizes = max(training.steps for training in trainings), 0, []
-    seconds, check_seconds, fit_seconds = 0.0, 0.0, []
+    seconds, check_seconds, fit_seconds, views = 0.0, 0.0, [], []
     for source, fit, training in zip(sources, fits, trainings, strict=True):
         size = most if source.given is None or not training.continues else len(source.given)
         own = fit.iterations if source.given is None else 0
@@ -78,31 +80,42 @@ def cost_of(
         longer = Bound.of(training, own or None)
         if bound and source.photos and not longer.equal:
             renders += longer.steps or 0
-        camera = source.scene.test[0].camera
-        step = step_seconds(device.type, size, camera.width * camera.height)
+        step = step_seconds(device.type, size, _pixels(source.scene))
         seconds += renders * step
-        check_seconds += _RENDERS * len(source.scene.test) * step + _READ_SECONDS * size
+        views.append(view_seconds(device.type, size, source.scene))
+        check_seconds += len(source.scene.test) * views[-1] + _READ_SECONDS * size
         fit_seconds.append(own * step)
         steps += own
         trained += size if own or training.steps else 0
         sizes.append(size)
     seconds += seconds_to_hide(sizes[0], sizes[1:]) + check_seconds
-    published = sizes[0] + (_MAX_APPENDED * sum(sizes[1:]) if options.channel_in().grows else 0)
+    appended = _MAX_APPENDED * sum(sizes[1:]) if options.channel_in().grows else 0
+    published = sizes[0] + appended
     degree = max(options.fit.sh_degree if each.given is None else each.given.sh_degree for each in sources)
     gaussian = 4 * (14 + 3 * (degree + 1) ** 2)  # bytes in a .ply, with normals
     resident: int = psutil.Process().memory_info().rss
     largest = max(published, *sizes) * gaussian
-    memory = resident + _COPIES * (published + sum(sizes[1:])) * gaussian
+    memory = resident + (_COPIES * (published + sum(sizes[1:])) + _CHUNKS * appended) * gaussian
     if trained:  # gradients, moments and two checkpoints
         memory += (1 + _CHECKPOINTS) * largest
         memory += max(Targets.max_bytes(source.scene.train) for source in sources)
     disk = (published + sum(sizes) + _CHECKPOINTS * trained) * gaussian + _OTHER_BYTES
-    return Cost(steps, seconds, tuple(fit_seconds), check_seconds, device.type, disk, memory)
+    return Cost(steps, seconds, tuple(fit_seconds), check_seconds, sum(views), device.type, disk, memory)
+
+
+def view_seconds(device: str, gaussians: int, scene: Scene) -> float:
+    """About the seconds to measure a model, and its plain model, on one test view of a scene."""
+    return _RENDERS * step_seconds(device, gaussians, _pixels(scene))
 
 
 def step_seconds(device: str, gaussians: int, pixels: int) -> float:
     """About the seconds of a training step on a device, "cpu" or "cuda"."""
     return _STEP_SECONDS[device] * (gaussians + pixels / 2)
+
+
+def _pixels(scene: Scene) -> int:
+    camera = scene.test[0].camera
+    return camera.width * camera.height
 
 
 def check_room(cost: Cost, out: Path | None) -> None:
@@ -115,21 +128,10 @@ def check_room(cost: Cost, out: Path | None) -> None:
                 f"{out}: expected {cost.disk_bytes / 1e6:,.0f} MB of free space for models and checkpoints, "
                 f"found {free / 1e6:,.0f} MB; make room, choose another place, or a smaller `max_gaussians`"
             )
-    if cost.memory_bytes > (available := _available_memory()):
+    if cost.memory_bytes > (available := available_memory()):
         warnings.warn(
             f"this takes about {cost.memory_bytes / 1e9:.1f} GB of memory, and {available / 1e9:.1f} GB are "
             "free: a smaller `width` or `max_gaussians` takes less",
             KeyssWarning,
             stacklevel=2,
         )
-
-
-def _available_memory() -> int:
-    """Bytes available on the machine and in its container (Linux, cgroup 2)."""
-    available: int = psutil.virtual_memory().available
-    with suppress(OSError, ValueError, KeyError):  # "max" without a limit
-        group = Path("/sys/fs/cgroup")
-        limit, used = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
-        cached = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-        available = min(available, limit - used + int(cached["inactive_file"]))
-    return available

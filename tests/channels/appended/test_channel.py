@@ -232,6 +232,13 @@ def test_it_opens_from_what_gsply_writes(stego: Gaussians, tmp_path: Path) -> No
     assert unharmed(read_model(compressed)) == DATA
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_copies_of_one_faint_gaussian_do_not_hide_the_frame(seed: int, stego: Gaussians) -> None:
+    faint = replace(lifelike(1, seed), opacity_logits=torch.tensor(1.5 / 255).logit()[None])
+    with pytest.warns(KeyssWarning, match="Gaussians were added"):
+        assert opened(Gaussians.cat([stego, faint[torch.zeros(8000, dtype=torch.int64)]])) == DATA
+
+
 def test_too_great_a_loss_is_told_from_a_wrong_key(stego: Gaussians) -> None:
     with pytest.raises(InputError, match=r"the key is right, but too much .* chunks are left"):
         opened(cropping(1)(stego))
@@ -309,12 +316,39 @@ def test_a_secret_put_into_another_file_is_told(
     name: str, salts: str, stego: Gaussians, other: Gaussians
 ) -> None:
     """The key opens it there, so its holder must hear that the file is another one's."""
-    host = other if salts == "kept" else other[:3000]
+    host = other[:3100] if salts == "kept" else other[:3000]  # few are left
     cover, appended = stego[:3000], stego[3000:]
-    if salts == "kept":
-        appended = appended[torch.arange(len(appended)).repeat(2)]  # outnumbers that of the file
     with pytest.warns(KeyssWarning, match="Gaussians were added"):
         assert opened(Gaussians.cat([host, ADDED[name](cover, appended)])) == DATA
+
+
+@pytest.mark.parametrize(
+    ("host", "own"),
+    [
+        (Similarity(), Similarity(1e6, translation=torch.full((3,), 1e9))),
+        (Similarity(translation=torch.full((3,), 3e5)), Similarity(1e-36)),
+    ],
+    ids=["far larger, far away", "a point beside numbers beyond float32"],
+)
+def test_a_file_out_of_range_of_the_sketch_is_told(host: Similarity, own: Similarity) -> None:
+    """From the cover of the secret it looks like few Gaussians, or like none."""
+    large = embedded(lifelike(60_000, 6), [(KEY, Payload("file", DATA))], entropy=ENTROPY)
+    visible = lifelike(60_000, 5)
+    visible = replace(visible[visible.opacities > 4 / 255], sh=visible.sh[visible.opacities > 4 / 255] / 20)
+    both = Gaussians.cat([host.apply_gaussians(visible), own.apply_gaussians(large)])
+    with pytest.warns(KeyssWarning, match="Gaussians were added"):
+        assert opened(both) == DATA
+
+
+def test_gaussians_with_equal_numbers_are_tested_under_every_key(cover: Gaussians) -> None:
+    """A border next to their opacity or thickness would leave out all of them."""
+    equal = lifelike(3000, 5)
+    equal = replace(equal, opacity_logits=torch.full((3000,), 2.0), log_scales=equal.log_scales * 0 - 4)
+    for seed in range(20):
+        key = f"{KEY} {seed}"
+        stego = embedded(cover, [(key, Payload("file", b"a"))], entropy=ENTROPY)
+        with pytest.warns(KeyssWarning, match="Gaussians were added"):
+            assert opened(Gaussians.cat([equal, stego]), key) == b"a"
 
 
 def test_stacks_of_faint_gaussians_are_told(stego: Gaussians) -> None:

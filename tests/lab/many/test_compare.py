@@ -33,7 +33,7 @@ def test_comparison_and_resume(
     monkeypatch.setattr(
         trial_measures,
         "two_sample_auc",
-        lambda a, b: Auc(float((a.means - b.means).abs().mean()), 0, 0),
+        lambda a, b: Auc(float((a.means.mean() - b.means.mean()).abs()), 0, 0),
     )
 
     def refuse(*_: object) -> None:

@@ -13,6 +13,7 @@ from keyss import KeyssOptions, WrongKeyError
 from keyss.channels import is_appended
 from keyss.core import InputError, KeyssWarning, UsageError
 from keyss.core.similarity import Similarity
+from keyss.fitting import save_checkpoint
 from keyss.fitting.losses import Target, ssim_torch
 from keyss.methods import DESIGNS, CombinedPoses, KeyssTraining, PlacedScene, Source, registry
 from keyss.rendering import render
@@ -183,6 +184,14 @@ def test_scene_subsets(which: Any) -> None:
 def test_resume(tmp_path: Path, design: str) -> None:
     options = small(design).with_fit(iterations=40, grow_every=5)
     check_resumes(options, tmp_path, "hide", three_scenes()[1][:2])
+
+
+def test_state_after_growth_can_be_saved(tmp_path: Path) -> None:
+    run = _run()
+    while run.iteration < FIT.refine_every:
+        run.step()
+    assert len(run) > run.started
+    save_checkpoint(tmp_path / "state", run.state(), {})
 
 
 def test_invalid_options() -> None:

@@ -37,7 +37,7 @@ export const ID_BYTES = 16;
 /**
  * The share, 0 to 1, of foreign Gaussians among those with `ids` [N, 16], by the sketch `own`; equal IDs count once.
  * `among`: places that each Gaussian hashes to, or for all of them the number of the sketch's Gaussians. 1 if less than a share
- * `gone` of the sketch's sample is there.
+ * `gone` of the sketch's sample, rounded down, is there.
  */
 export function foreignShare(
   secret: Uint8Array, ids: Uint8Array, own: Uint8Array, among: number | readonly number[], gone = 0,
@@ -53,7 +53,7 @@ export function foreignShare(
     const place = low % Math.max(1, typeof among === 'number' ? among : among[row]);
     if (place < kept) sampled.set(low * 2 ** 21 + (high >>> 11), place);
   }
-  if (sampled.size < gone * (bits - unset)) return 1;
+  if (sampled.size < Math.floor(gone * (bits - unset))) return 1;
   const found = [...sampled.values()].filter(isUnset).length;
   return Math.min(1, found / Math.max(1e-9, (sampled.size * unset) / Math.max(1, bits)));
 }

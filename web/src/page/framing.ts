@@ -16,8 +16,7 @@ const [TILT, STEP] = [48, 5]; // degrees from -y, as captures leave it; between 
 const EXACT = 6; // degrees from the axes of other programs
 const [TILTED_FLOOR, AXIS_FLOOR] = [0.07, 0.18]; // share of the area in a floor
 const CLEARLY = 1.5; // ratio of the floor across an unusual direction to that across the usual one
-// Radii by which the middle of a model may be below a floor across an axis; from the second on, y is up.
-const [HIGHEST, BELOW] = [0.3, 0.05];
+const BELOW = 0.05; // radii by which the middle of a model is below a floor across y where y is up
 
 /** Gaussians of a model, sampled. */
 export interface Sample {
@@ -109,7 +108,7 @@ class Floors {
    * The largest floor across one of the directions: its share of the area, how far in radii the model is above it on
    * average, at least `leastAbove`, and the direction.
    */
-  private largest(directions: readonly Vector[], leastAbove = -HIGHEST): Floor {
+  private largest(directions: readonly Vector[], leastAbove = -Infinity): Floor {
     const total = Math.max(sum(this.areas), 1e-30);
     let best: Floor = { share: 0, above: 0, direction: directions[0] };
     for (const direction of directions) {

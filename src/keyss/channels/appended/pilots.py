@@ -74,8 +74,8 @@ def write(salt: bytes, count: int, random: np.random.Generator) -> Bits:
 
 
 def count(invariants: Words) -> int:
-    """The number of pilots among words with `invariants` [N]."""
-    return int(_is_pilot(invariants).sum())
+    """The number of different pilots among words with `invariants` [N]."""
+    return len(_pilots(invariants))
 
 
 def read(invariants: Words, means: Doubles) -> PilotFit | None:
@@ -84,7 +84,7 @@ def read(invariants: Words, means: Doubles) -> PilotFit | None:
     None if too few agree.
     """
     random = np.random.default_rng(0)
-    own = np.flatnonzero(_is_pilot(invariants))
+    own = _pilots(invariants)
     if len(own) < _MIN_INLIERS:
         return None
     places = mix(mix(invariants[own] ^ _PUBLIC))
@@ -153,6 +153,12 @@ def _salt(invariants: Words) -> bytes | None:
     if not all(votes):
         return None
     return b"".join(each.most_common(1)[0][0].to_bytes(2, "big") for each in votes)
+
+
+def _pilots(invariants: Words) -> Integers:
+    """Rows of different pilots; copies of one faint Gaussian would outnumber the others."""
+    found = np.flatnonzero(_is_pilot(invariants))
+    return found[np.sort(np.unique(invariants[found], return_index=True)[1])]
 
 
 def _is_pilot(invariants: Words) -> Flags:

@@ -201,8 +201,9 @@ def write_header(key: bytes, value: int, noise: Bytes) -> Bits:
 
 
 def read_header(key: bytes, words: Bits, width: int) -> int | None:
-    """The value of the headers by majority; None if too few agree."""
-    numbers, _ = read_packets(key, words, width)
+    """The value of the headers by majority; None if too few agree. Copies of one word have one vote."""
+    numbers, data = read_packets(key, words, width)
+    numbers = numbers[np.unique(data.view(f"V{width}")[:, 0], return_index=True)[1]]
     votes = np.bincount(numbers[numbers < 1 << _HEADER_BITS].astype(np.int64), minlength=1)
     return int(votes.argmax()) if votes.max() >= _MIN_VOTES else None
 

@@ -17,13 +17,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 
-from keyss.core.arrays import Bits, Bytes, Doubles, Integers, Words32
+from keyss.core.arrays import Bytes, Doubles, Integers, Words32
 from keyss.core.gaussians import Gaussians
 from keyss.kernels.blake2b import blake2b_rows
+from keyss.kernels.jit import kernel
 from keyss.kernels.parallel import in_blocks
 
 GEOMETRY = 8  # fields before the harmonics: three log scales, four parts of a quaternion, opacity logit
@@ -88,13 +90,12 @@ def gaussian_ids(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
 def read_low_bits(gaussians: Gaussians, depth: int = DEEPEST, layout: Layout | None = None) -> Bytes:
     """[N, B] the low bits of each Gaussian, field after field, the highest bit first; B = `layout.width`."""
     layout = layout or Layout.of(gaussians)
-    packed = np.empty((len(gaussians), layout.width(depth)), np.uint8)
+    packed, columns = np.empty((len(gaussians), layout.width(depth)), np.uint8), layout.columns
 
     def pack(start: int, stop: int) -> None:
-        bits = _low_bits(used_words(gaussians[start:stop])[:, layout.columns], depth)
-        packed[start:stop] = np.packbits(bits, axis=1)[:, : packed.shape[1]]
+        _pack(used_words(gaussians[start:stop]), columns, depth, packed[start:stop])
 
-    in_blocks(pack, len(gaussians), BLOCK)
+    in_blocks(pack, len(gaussians), BLOCK, _pack)
     return packed
 
 
@@ -105,24 +106,21 @@ def write_low_bits(
 
     Bits beyond the B bytes keep their values.
     """
+    columns = layout.columns
     written = gaussians.detach().to("cpu").map(torch.Tensor.contiguous).map(torch.clone)
     for depth, rows, data in parts:
 
         def write(
             start: int, stop: int, depth: int = depth, rows: Integers = rows, data: Bytes = data
         ) -> None:
-            own, mask = rows[start:stop], np.uint32((1 << depth) - 1 << 1)
+            own = rows[start:stop]
             words = np.concatenate([group[own] for group in group_words(written)], axis=1)
-            fields = words[:, layout.columns]
-            bits = _low_bits(fields, depth)
-            bits[:, : 8 * data.shape[1]] = np.unpackbits(data[start:stop], axis=1)
-            low = np.packbits(bits.reshape(len(own), -1, depth), axis=2)[:, :, 0].astype(np.uint32)
-            words[:, layout.columns] = fields & ~mask | low >> np.uint32(8 - depth) << np.uint32(1)
+            _unpack(words, columns, depth, data[start:stop].copy())
             at = 0
             for group in group_words(written):
                 group[own] = words[:, at : (at := at + group.shape[1])]
 
-        in_blocks(write, len(rows), BLOCK)
+        in_blocks(write, len(rows), BLOCK, _unpack)
     return written.to(gaussians.device)
 
 
@@ -137,10 +135,38 @@ def group_words(gaussians: Gaussians) -> Iterator[Words32]:
     return map(_words, groups)
 
 
-def _low_bits(fields: Words32, depth: int) -> Bits:
-    """[N, F x depth] bits `depth` to 1 of fields [N, F]."""
-    low = (fields >> np.uint32(1)).astype(np.uint8)
-    return np.unpackbits(low[:, :, None], axis=2)[:, :, 8 - depth :].reshape(len(low), -1)
+@kernel
+def _pack(words: Any, columns: Any, depth: int, packed: Any) -> None:
+    """Set `packed` [N, B] to the low bits of the `columns` of words [N, F]; see `read_low_bits`."""
+    mask = (1 << depth) - 1
+    for row in range(len(words)):
+        bits, held, at = 0, 0, 0  # `held` bits are not packed yet
+        for column in columns:
+            bits = bits << depth | np.int64(words[row, column] >> np.uint32(1)) & mask
+            held += depth
+            if held >= 8:
+                held -= 8
+                packed[row, at] = bits >> held
+                at += 1
+                bits &= (1 << held) - 1
+
+
+@kernel
+def _unpack(words: Any, columns: Any, depth: int, data: Any) -> None:
+    """Replace low bits of the `columns` of words [R, F] by `data` [R, B]; see `write_low_bits`."""
+    for row in range(len(words)):
+        bits, held, at = 0, 0, 0  # `held` bits are not written yet
+        for column in columns:
+            if held < depth and at < data.shape[1]:
+                bits = bits << 8 | np.int64(data[row, at])
+                held += 8
+                at += 1
+            count = min(held, depth)  # fewer than `depth` only at the end of the data
+            held -= count
+            new = bits >> held << (depth - count + 1)
+            mask = ((1 << count) - 1) << (depth - count + 1)
+            words[row, column] = np.uint32(words[row, column] & ~mask | new)
+            bits &= (1 << held) - 1
 
 
 def _words(values: torch.Tensor) -> Words32:

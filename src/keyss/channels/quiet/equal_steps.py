@@ -40,24 +40,17 @@ class Steps:
     A *cell* is the range of a number's low bits at a depth.
     """
 
-    def __init__(self, gaussians: Gaussians, layout: Layout, neighbours: int = _NEIGHBOURS) -> None:
+    def __init__(self, gaussians: Gaussians, layout: Layout) -> None:
         means = np.nan_to_num(doubles(gaussians.means), posinf=0, neginf=0)
         self.order = morton_order(means.astype(np.float32))  # neighbours are near in memory, too
         means, count = means[self.order], len(means)
-        self.near = np.empty((count, min(neighbours, max(0, count - 1))), np.int32)
-        # [N, groups, members] bit patterns of what may move by equal steps, in `order`
-        self.words = [np.empty((count, 1 + layout.quats, 4), np.uint32)]
-        if gaussians.sh_degree:
-            self.words.append(np.empty((count, 3, (gaussians.sh_degree + 1) ** 2 - 1), np.uint32))
+        self.near = np.empty((count, min(_NEIGHBOURS, max(0, count - 1))), np.int32)
+        self.words = _no_words(gaussians, layout, count)  # in `order`
         tree = Neighbours(means, self.near.shape[1] + 1) if self.near.size else None
 
         def gather(start: int, stop: int) -> None:
             used = used_words(gaussians[torch.from_numpy(self.order[start:stop])])
-            geometry, size = self.words[0][start:stop], stop - start
-            geometry[:, 0, :3], geometry[:, 0, 3] = used[:, :3], used[:, GEOMETRY - 1]
-            geometry[:, 1:] = used[:, None, QUATS]
-            for harmonics in self.words[1:]:
-                harmonics[start:stop] = used[:, GEOMETRY:].reshape(size, -1, 3).transpose(0, 2, 1)
+            _fill(self.words, start, stop, used)
             if tree:
                 self.near[start:stop] = tree.of(means[start:stop])[1][:, 1:]
 
@@ -69,7 +62,7 @@ class Steps:
 
         def mark(start: int, stop: int) -> None:
             for words in self.words:
-                _mark(start, self.near[start:stop], words, depth, apart)
+                _mark(start, stop, self.near, words, depth, apart)
 
         in_blocks(mark, len(apart), _ROWS)
         found = np.empty_like(apart)
@@ -101,8 +94,34 @@ class Steps:
 
 def moved_from_zero(gaussians: Gaussians, layout: Layout) -> Flags:
     """Mask [N] of Gaussians whose numbers moved by equal amounts away from zero, at the least depth."""
-    steps = Steps(gaussians, layout, 0)
-    return steps.equal(LEAST)
+    moved = np.zeros(len(gaussians), bool)
+
+    def mark(start: int, stop: int) -> None:
+        size = stop - start
+        words, none = _no_words(gaussians, layout, size), np.empty((size, 0), np.int32)
+        _fill(words, 0, size, used_words(gaussians[start:stop]))
+        for each in words:
+            _mark(0, size, none, each, LEAST, moved[start:stop])
+
+    in_blocks(mark, len(moved), _ROWS, _mark)
+    return moved
+
+
+def _no_words(gaussians: Gaussians, layout: Layout, count: int) -> list[Words32]:
+    """Arrays [count, groups, members] for the bit patterns of what may move by equal steps."""
+    words = [np.empty((count, 1 + layout.quats, 4), np.uint32)]
+    if gaussians.sh_degree:
+        words.append(np.empty((count, 3, (gaussians.sh_degree + 1) ** 2 - 1), np.uint32))
+    return words
+
+
+def _fill(words: list[Words32], start: int, stop: int, used: Words32) -> None:
+    """Set rows of `words` to those of `used` [R, F]."""
+    geometry = words[0][start:stop]
+    geometry[:, 0, :3], geometry[:, 0, 3] = used[:, :3], used[:, GEOMETRY - 1]
+    geometry[:, 1:] = used[:, None, QUATS]
+    for harmonics in words[1:]:
+        harmonics[start:stop] = used[:, GEOMETRY:].reshape(stop - start, -1, 3).transpose(0, 2, 1)
 
 
 def redrawn(words: Words32, chosen: Flags, depth: int, random: np.random.Generator) -> Words32:
@@ -120,19 +139,23 @@ def _equal_pairs(places: Integers, known: Words32, words: Words32, depth: int) -
 
 
 @kernel
-def _mark(first: int, near: Any, words: Any, depth: int, apart: Any) -> None:
-    """Set `apart` [N] for pairs of a row from `first` on and its neighbours in `near` [R, K], or zero."""
+def _mark(start: int, stop: int, near: Any, words: Any, depth: int, apart: Any) -> None:
+    """Set `apart` [N] for pairs of rows `start` to `stop` and their neighbours in `near` [N, K], or zero."""
     size = words.shape[2]
     low, half, exponent = np.uint32((1 << depth + 1) - 1), np.uint32(1 << depth), np.uint32(0x7F800000)
     share = np.float32(2.0 ** (depth + 1 - 23))
     x, y, top = np.empty(size, np.uint32), np.zeros(size, np.uint32), np.empty(size, np.uint32)
     own, its, span = x.view(np.float32), y.view(np.float32), top.view(np.float32)
     steps = np.empty(size, np.float32)
-    for row in range(len(near)):
-        one = first + row
+    for one in range(start, stop):
         for place in range(near.shape[1] + 1):
-            other = one if place == 0 else near[row, place - 1]
+            other = one if place == 0 else near[one, place - 1]
             if (apart[one] and apart[other]) or (place > 0 and other == one):
+                continue
+            seen = False  # a pair of mutual neighbours is judged once
+            for each in range(near.shape[1] if other < one else 0):
+                seen |= near[other, each] == one
+            if seen:
                 continue
             for group in range(words.shape[1]):
                 for at in range(size):

@@ -138,7 +138,7 @@ class QuietReader(SaltedReader):
             return BlockReader.of(decoded.codes, decoded)
         layout = Layout.of(stego)
         ids, low = gaussian_ids(stego, layout), read_low_bits(stego, LEAST, layout)
-        rows = _unique_rows(ids, read_low_bits(stego, DEEPEST, layout))
+        rows = _unique_rows(stego, ids, layout)
         if len(rows) < len(ids):
             stego, ids, low = stego[torch.from_numpy(rows)], ids[rows], low[rows]
         salts = [salt(ids[row], low[row]) for row in salt_rows(stego, ids, layout)]
@@ -183,11 +183,12 @@ class QuietReader(SaltedReader):
         return decrypt(payload_key, encrypted[: found.size], ASSOCIATED)
 
 
-def _unique_rows(ids: Bytes, low: Bytes) -> Integers:
-    """Rows [M] that differ in `ids` [N, 16] or `low` bits [N, B]."""
+def _unique_rows(stego: Gaussians, ids: Bytes, layout: Layout) -> Integers:
+    """Rows [M] that differ in `ids` [N, 16] or low bits."""
     repeats = np.flatnonzero(repeated(ids.view("<u8")[:, 0]))
     if not len(repeats):
         return np.arange(len(ids))
-    whole = np.concatenate([ids[repeats], low[repeats]], axis=1)
+    low = read_low_bits(stego[torch.from_numpy(repeats)], DEEPEST, layout)
+    whole = np.concatenate([ids[repeats], low], axis=1)
     _, first = np.unique(whole.view(f"S{whole.shape[1]}")[:, 0], return_index=True)
     return np.setdiff1d(np.arange(len(ids)), np.delete(repeats, first))

@@ -29,7 +29,8 @@ from keyss.measure.hide_quality import WrongKeys
 from keyss.progress import Reporter, Share
 from keyss.rendering import Backend, resolve_device
 from keyss.runs import read_record, write_record
-from keyss.runs.files import REPORT, PathLike, run_folder
+from keyss.runs.estimates import seconds_for
+from keyss.runs.files import REPORT, PathLike, run_folder, stego_in
 from keyss.runs.folder import PRIVATE, RunFolder, write_again
 from keyss.runs.open_run import open_run
 
@@ -111,7 +112,8 @@ def audit(
     for module in EXTRA:
         import_extra(module, "audit", "audit a run")
     started, reporter = time.monotonic(), reporter or Reporter()
-    opened = open_run(run, keys)
+    with reporter.waiting("opening the secrets", len(keys) * seconds_for("reveal", stego_in(Path(run)))):
+        opened = open_run(run, keys)
     subject = Subject(opened, resolve_device(device))
     excluded = set() if subject.standard else NEED_A_3DGS_MODEL
     if impossible := sorted(set(only) & excluded):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from keyss.core.errors import UsageError
 from keyss.files.scenes import read_layout
 from keyss.lab.robustness.converters import converters
 from keyss.lab.robustness.survival import CHANGES, TRAINING_STEPS
+from keyss.lab.two_sample import MAX_GAUSSIANS
 from keyss.methods import registry
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import IMAGE_SIZE, is_model
@@ -19,12 +21,16 @@ from keyss.runs.planning import step_seconds
 from keyss.runs.run_records import HideMetrics, read_config
 
 _VIEWS = 8  # test views of a model's scene, and most that robustness and leaks render
-_TIMED, _ROUNDS = 4, 32  # renders of two models for a time
-_ATTACKS = 100  # variants of attacks, each on the file and on a control
+_PICTURED = 64  # most views that StegExpose judges
+_RENDER = 1 / 4  # time of a render over that of a training step
+_TIMED = 64  # renders of a model and of its plain model for a time
+_ATTACKS = 20  # renders of attacks on the file and on a control
+_ATTACK_SECONDS = 3.0  # of attacks without renders
 _OPEN_SECONDS = 2.0  # a key on a changed model, which often opens nothing: then every salt is tried
 _DECODER_STEPS = 1200  # of the search for the key of a decoder
-# Per Gaussian: transport and trees on parameters, statistics of the file.
-_PARAMETER_SECONDS, _STEALTH_SECONDS = 4.5e-4, 6e-5
+# Of trees that separate two models: in all, and per Gaussian of their sample.
+_TREES_SECONDS, _TREE_SECONDS = 0.6, 1.3e-4
+_DISTANCE_SECONDS, _STEALTH_SECONDS = 1e-5, 1.8e-4  # per Gaussian of a model
 _PICTURE_SECONDS = 5e-8  # StegExpose, per pixel of a picture
 
 
@@ -58,18 +64,20 @@ def forecast_audit(
     training = fit.iterations * step_seconds(kind, fit.max_gaussians, sizes[0][1])
     decoder = _DECODER_STEPS if metrics.wrong_key else 0
     changed = sum(views * step for views, step in zip(few, steps, strict=True)) + _OPEN_SECONDS * secrets
+    trees = _TREES_SECONDS + _TREE_SECONDS * min(counts[0], MAX_GAUSSIANS)
+    pairs = 2 * controls + math.comb(controls, 2)
     seconds = {
         "controls": controls * training,
-        "images": 6 * sum(views * step for views, step in zip(every, steps, strict=True)),
-        "parameters": (2 * controls + 1) * (_PARAMETER_SECONDS * counts[0]),
-        "stealth": _STEALTH_SECONDS * counts[0] * (controls + 2),
-        "stegexpose": 3 * every[0] * (steps[0] + _PICTURE_SECONDS * sizes[0][1]),
-        "leaks": secrets * (2 * _ATTACKS * few[0] + decoder) * steps[0],
+        "images": 3 * sum(views * step for views, step in zip(every, steps, strict=True)),
+        "parameters": pairs * trees + (controls + 2) * _DISTANCE_SECONDS * counts[0],
+        "stealth": (controls + 2) * _STEALTH_SECONDS * counts[0],
+        "stegexpose": 3 * _PICTURED * (_RENDER * steps[0] + _PICTURE_SECONDS * sizes[0][1]),
+        "leaks": secrets * (_ATTACK_SECONDS + (2 * _ATTACKS * few[0] + decoder) * steps[0]),
         "robustness": (CHANGES + len(converters())) * changed + TRAINING_STEPS * steps[0],
-        "speed": _ROUNDS * _TIMED * sum(steps) / 2,
+        "speed": 2 * _TIMED * _RENDER * sum(steps),
     }
     parts = ("controls", *chosen_parts(only, standard))
-    return AuditForecast({name: 0.3 + seconds[name] for name in parts}, kind, fit.iterations)
+    return AuditForecast({name: 0.1 + seconds[name] for name in parts}, kind, fit.iterations)
 
 
 def _views_and_pixels(source: str | None, width: int | None, skip_missing: bool) -> tuple[int, int]:

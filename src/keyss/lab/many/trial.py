@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import zip_longest
 from math import isfinite
@@ -32,10 +33,11 @@ from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs import FitMetrics, HideMetrics, Manifest, read_manifest, read_record, record_bytes
-from keyss.runs.files import METRICS, as_scene
+from keyss.runs.estimates import seconds_for
+from keyss.runs.files import METRICS, as_scene, stego_in
 from keyss.runs.folder import PRIVATE, make_private
 from keyss.runs.open_run import HidingRun, open_run
-from keyss.runs.planning import Cost, cost_of_fit
+from keyss.runs.planning import Cost, cost_of_fit, view_seconds
 
 TRIAL, RESULT, RUN = "trial.json", "result.json", "run"
 MASTER_KEY = f"{PRIVATE}/master-key.txt"  # relative to the folder of all trials
@@ -78,9 +80,15 @@ class Trial:
         return [Path(each).parts[1] for each in models]
 
 
-# Of measures of small scenes, mostly wrong keys and attempts to open; others grow with the time of a fit.
-_MEASURE_SECONDS = {"files": 0.0, "pictures": 2.0, "secrecy": 8.0, "survival": 15.0, "robustness": 120.0}
-_OTHER_SECONDS, _USUAL_SECONDS = 5.0, 60.0
+# Seconds of measures: of all, mostly attempts to open; in views rendered; and per Gaussian.
+_COSTS = {
+    "files": (0.0, 0, 0.0),
+    "pictures": (0.0, 8, 0.0),
+    "secrecy": (0.5, 43, 9e-4),
+    "survival": (8.0, 48, 0.0),
+    "robustness": (100.0, 1000, 0.0),
+}
+_OTHER_COST = 1.0, 16, 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,9 +143,14 @@ def cost_of_trial(trial: Trial, folder: Path) -> Cost:
     cost = hide(**_hide_arguments(trial, folder, keys), dry_run=True).cost
     assert cost is not None  # a dry run always has a cost
     elsewhere = [seconds for seconds, model in zip_longest(cost.fit_seconds, trial.models) if model]
-    measures = sum(_MEASURE_SECONDS.get(name, _OTHER_SECONDS) for name in trial.measures)
-    measures *= 1 + max(cost.fit_seconds, default=0.0) / _USUAL_SECONDS
+    measures = _seconds_of(trial.measures, cost.view_seconds, trial.options.fit.max_gaussians)
     return replace(cost, seconds=cost.seconds - sum(elsewhere) + measures)
+
+
+def _seconds_of(measures: Sequence[str], view: float, gaussians: int) -> float:
+    """About the seconds of measures; `view`: see `Cost.view_seconds`, `gaussians`: of the published model."""
+    costs = [_COSTS.get(name, _OTHER_COST) for name in measures]
+    return sum(fixed + views * view + each * gaussians for fixed, views, each in costs)
 
 
 def keys_of(trial: Trial, folder: Path) -> list[str]:
@@ -214,8 +227,15 @@ def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -
             found |= flat(msgspec.to_builtins(getattr(audited, part)), f"audit.{part}")
     if others := [name for name in names if name not in PARTS]:
         device = resolve_device(trial.device)
-        controls = [read_model(_place(folder, each)).to(device) for each in trial.controls]
-        subject = Subject(opened_run(trial, folder), device, controls)
+        with reporter.waiting(f"opening {trial.name}", seconds_for("reveal", stego_in(folder / RUN))):
+            controls = [read_model(_place(folder, each)).to(device) for each in trial.controls]
+            subject = Subject(opened_run(trial, folder), device, controls)
+            models = [subject.stego, *subject.revealed]
+            view = sum(
+                view_seconds(device.type, len(model), scene)
+                for model, scene in zip(models, subject.scenes, strict=True)
+            )
         for name in others:
-            found |= {f"{name}.{each}": value for each, value in MEASURES[name](subject).items()}
+            with reporter.waiting(f"{trial.name}: {name}", _seconds_of([name], view, len(subject.stego))):
+                found |= {f"{name}.{each}": value for each, value in MEASURES[name](subject).items()}
     return found

@@ -131,10 +131,15 @@ function readPackets(key: Uint8Array, bytes: Uint8Array, width: number): [number
   return found;
 }
 
-/** The codewords by majority of the headers; null if too few agree. */
+/** The codewords by majority of the headers; null if too few agree. Copies of one word have one vote. */
 function readHeader(key: Uint8Array, words: Uint8Array, width: number): Codewords | null {
   const votes = new Uint32Array(1 << HEADER_BITS);
-  for (const [number] of readPackets(key, words, width)) if (number < votes.length) votes[number]++;
+  const seen = new Set<number>();
+  for (const [number, data] of readPackets(key, words, width)) {
+    const first = viewOf(data).getUint32(0) * 2 ** 16 + viewOf(data).getUint16(4);
+    if (number < votes.length && !seen.has(first)) votes[number]++;
+    seen.add(first);
+  }
   const header = votes.reduce((best, each, value) => (each > votes[best] ? value : best), 0);
   if (!(votes[header] >= AGREEING_HEADERS && header > 0)) return null;
   const count = Math.ceil(header / MAX_DATA);

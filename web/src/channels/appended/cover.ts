@@ -2,6 +2,7 @@
 import { viewOf } from '../../core/bytes.ts';
 import { coefficients, type Gaussians, opacity } from '../../core/gaussians.ts';
 import { movedPoint, type Similarity } from '../../core/similarity.ts';
+import { encryptBlocks } from '../../keys/aes.ts';
 import { expand } from '../../keys/keys.ts';
 import { foreignShare, ID_BYTES } from '../base.ts';
 
@@ -14,8 +15,8 @@ const VISIBLE = 3.5 / 255; // minimum opacity; 8 bits round none across it
 const SKETCH_BYTES = 128;
 
 const [MORE, GONE] = [1.25, 0.02]; // factor by which formats may increase the number of faint Gaussians; share of the sample
-const TESTED = 0.1; // share of the visible Gaussians; about a third are not next to a border
-const SKETCH = 12; // after three numbers
+const SKETCH = 16; // after four numbers
+const POSITIONS = 3; // the first numbers
 
 export const COVER_BYTES = SKETCH + SKETCH_BYTES;
 
@@ -23,40 +24,72 @@ export const COVER_BYTES = SKETCH + SKETCH_BYTES;
 export function foreignCount(packed: Uint8Array, model: Gaussians, toOwn: Similarity, secret: Uint8Array, share: number): number {
   const view = viewOf(packed);
   const [before, faint] = [view.getUint32(0, true), model.opacityLogits.reduce((sum, each) => sum + Number(opacity(each) <= VISIBLE), 0)];
-  const more = faint > MORE * before ? faint - before : 0; // a hundred of them in one place are visible
-  const [count, area] = [Math.max(1, view.getUint32(4, true)), Math.max(1e-30, view.getFloat32(8, true))];
-  const [larger, width] = [Math.log(toOwn.scale), 3 * coefficients(model.shDegree)];
-  const offsets = Array.from(expand(secret, 'bins').subarray(0, BINS.length), (byte) => (byte + 0.5) / 256);
-  const ids = new Int8Array(ID_BYTES * model.count);
+  const outsideBefore = view.getUint32(4, true);
+  const [count, area] = [Math.max(1, view.getUint32(8, true)), Math.max(1e-30, view.getFloat32(12, true))];
+  const rows = numbersOf(model, toOwn);
+  const [steps, offsets] = stepsOf(rows, secret);
+  const ids = new Int8Array(ID_BYTES * rows.length);
   const among: number[] = [];
-  for (let row = 0; row < model.count; row++) {
-    const numbers = [
-      ...movedPoint(toOwn, model.means.subarray(3 * row, 3 * row + 3)),
-      ...model.logScales.subarray(3 * row, 3 * row + 3).map((each) => each + larger),
-      opacity(model.opacityLogits[row]),
-      ...model.sh.subarray(width * row, width * row + 3),
-    ];
-    if (!(numbers.every(Number.isFinite) && numbers[6] > VISIBLE)) continue;
-    const bins = numbers.map((each, at) => binOf(each, at, offsets[at]));
-    if (bins.some((bin) => bin === null)) continue; // a format may have moved it from another bin
-    const middles = bins.map((bin, at) => (bin! + 0.5 - offsets[at]) * BINS[at]);
+  for (const [row, numbers] of rows.entries()) {
+    const bins = steps[row].map(Math.floor);
+    // A format may have moved it from another bin.
+    if (numbers.some((each, at) => each > LOW[at] && each < HIGH[at] && isNearBorder(steps[row][at], at))) continue;
+    const middles = bins.map((bin, at) => (bin + 0.5 - offsets[row][at]) * BINS[at]);
     const [, b, c] = middles.slice(3, 6).sort((x, y) => x - y);
     const size = Math.exp(b + c) * Math.max(0.02, Math.min(1, middles[6])) / area;
-    ids.set(bins as number[], ID_BYTES * among.length);
+    ids.set(bins, ID_BYTES * among.length);
     among.push(Math.max(8 * SKETCH_BYTES, Math.round(2 / (1 / count + size))));
   }
   const own = new Uint8Array(ids.buffer, 0, ID_BYTES * among.length);
   const visible = model.count - faint;
-  const gone = among.length > TESTED * visible ? GONE : 0; // else most have one number, next to a border
-  const found = foreignShare(secret, own, packed.subarray(SKETCH), among, gone);
-  return more + (found > share ? Math.round(found * visible) : 0);
+  const found = foreignShare(secret, own, packed.subarray(SKETCH), among, GONE);
+  let sure = found > share ? Math.round(found * visible) : 0;
+  const outside = rows.filter(isOutside).length;
+  if (outside > outsideBefore + share * visible) sure = Math.max(sure, outside - outsideBefore);
+  return sure + (faint > MORE * before ? faint - before : 0); // a hundred faint ones in one place are visible
 }
 
-/** The bin of a number; null if it is next to a border. */
-function binOf(value: number, at: number, offset: number): number | null {
-  const inside = Math.max(LOW[at], Math.min(HIGH[at], value));
-  const step = inside / BINS[at] + offset;
-  const bin = Math.floor(step);
-  const near = Math.min(step - bin, bin + 1 - step) < ERRORS[at] / BINS[at];
-  return near && inside > LOW[at] && inside < HIGH[at] ? null : bin;
+/** Numbers of the visible Gaussians in the own frame, in the range of the bins. */
+function numbersOf(model: Gaussians, toOwn: Similarity): number[][] {
+  const [larger, width] = [Math.log(toOwn.scale), 3 * coefficients(model.shDegree)];
+  const rows: number[][] = [];
+  for (let row = 0; row < model.count; row++) {
+    const numbers = [
+      ...movedPoint(toOwn, model.means.subarray(3 * row, 3 * row + 3)),
+      ...Array.from(model.logScales.subarray(3 * row, 3 * row + 3), (each) => each + larger),
+      opacity(model.opacityLogits[row]),
+      ...model.sh.subarray(width * row, width * row + 3),
+    ];
+    if (!(numbers.every(Number.isFinite) && numbers[6] > VISIBLE)) continue;
+    rows.push(numbers.map((each, at) => Math.max(LOW[at], Math.min(HIGH[at], each))));
+  }
+  return rows;
+}
+
+/** Numbers in bins, and the offsets of the borders: those after the positions depend on the position's bin. */
+function stepsOf(rows: readonly number[][], secret: Uint8Array): [steps: number[][], offsets: number[][]] {
+  const first = Array.from(expand(secret, 'bins').subarray(0, POSITIONS), offsetOf);
+  const blocks = new Int8Array(ID_BYTES * rows.length);
+  rows.forEach((numbers, row) => {
+    blocks.set(first.map((offset, at) => Math.floor(numbers[at] / BINS[at] + offset)), ID_BYTES * row);
+  });
+  const borders = encryptBlocks(expand(secret, 'borders'), new Uint8Array(blocks.buffer));
+  const offsets = rows.map((_, row) => {
+    const own = borders.subarray(ID_BYTES * row, ID_BYTES * row + BINS.length - POSITIONS);
+    return [...first, ...Array.from(own, offsetOf)];
+  });
+  return [rows.map((numbers, row) => numbers.map((each, at) => each / BINS[at] + offsets[row][at])), offsets];
+}
+
+const offsetOf = (random: number): number => (random + 0.5) / 256;
+
+function isNearBorder(step: number, at: number): boolean {
+  const inside = step - Math.floor(step);
+  return Math.min(inside, 1 - inside) < ERRORS[at] / BINS[at];
+}
+
+/** True if a position, or two of the log scales, are out of range. */
+function isOutside(numbers: readonly number[]): boolean {
+  const far = numbers.map((each, at) => each <= LOW[at] || each >= HIGH[at]);
+  return far.slice(0, POSITIONS).some(Boolean) || far.slice(POSITIONS, 6).filter(Boolean).length > 1;
 }

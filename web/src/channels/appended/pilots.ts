@@ -80,10 +80,15 @@ function saltOf(invariants: Words, rows: number[]): Uint8Array | null {
   return salt;
 }
 
-/** The rows of `invariants` [N] that are pilots. */
+/** The rows of different pilots among `invariants` [N]: copies of one faint Gaussian would outnumber the others. */
 export function pilotsOf(invariants: Words): number[] {
-  const rows: number[] = [];
-  for (let row = 0; row < invariants.length >> 1; row++) if (publicHash(invariants, row)[0] % ONE_IN === 0) rows.push(row);
+  const [rows, seen] = [[] as number[], new Set<number>()];
+  for (let row = 0; row < invariants.length >> 1; row++) {
+    if (publicHash(invariants, row)[0] % ONE_IN !== 0) continue;
+    const word = invariants[2 * row] + 2 ** 32 * invariants[2 * row + 1];
+    if (!seen.has(word)) rows.push(row);
+    seen.add(word);
+  }
   return rows;
 }
 
