@@ -19,7 +19,8 @@ import os
 import time
 from pathlib import Path
 
-from keyss.channels import SUFFIXES, InCodes, Payload, QuietReader
+from keyss.channels import SUFFIXES, InCodes, Payload
+from keyss.channels.quiet.blocks import BlockReader
 from keyss.channels.quiet.fields import FORMATS
 from keyss.core import Gaussians, Scene
 from keyss.files import write_bytes
@@ -71,7 +72,7 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         file = stego.codes.serialise()
         hiding = time.monotonic() - start
         start = time.monotonic()
-        opened = decode(QuietReader.of_codes(format_.parse(file)).open(KEY).data)
+        opened = decode(BlockReader.of(format_.parse(file)).open(KEY).data)
         revealing = time.monotonic() - start
         bits = 8 * left / len(model)
         most = 8 * left / (8 * len(encode(kept)) / len(kept)) / len(model)

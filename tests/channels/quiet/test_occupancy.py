@@ -23,6 +23,7 @@ OWN = keys(0)
 HIDINGS = 40
 CAPACITY = LowBitsCapacity(CARRIERS, {LEAST: CARRIERS}, LAYOUT)
 QUARTER = CAPACITY.for_payloads().steps[0][1] - 100  # bytes that fit into a quarter of these carriers
+THIRD = CAPACITY.payload_capacity(3) - 100  # bytes that fit into equal shares of three
 
 
 def _seen(sizes: Sequence[int]) -> list[float]:
@@ -77,10 +78,10 @@ def test_secrets_lie_as_if_they_were_alone(own: int, others: list[int]) -> None:
 
 def test_who_is_crowded_is_warned_for_it_can_be_seen() -> None:
     """The control: the numbers do show it where secrets do not fit as each would alone."""
-    alone, more = [_seen([QUARTER]) for _ in range(HIDINGS)], QUARTER * 6 // 5  # alone in a half
+    alone = [_seen([QUARTER]) for _ in range(HIDINGS)]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        beside = [_seen([QUARTER, more, more]) for _ in range(HIDINGS)]
+        beside = [_seen([QUARTER, THIRD, THIRD]) for _ in range(HIDINGS)]
     assert {each.category for each in caught} == {KeyssWarning}
     assert _least_chance(alone, beside) < 1e-10
     with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):

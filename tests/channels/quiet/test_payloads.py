@@ -79,9 +79,9 @@ def test_the_same_entropy_gives_the_same_bits_and_other_payloads_others(plain: G
     own, entropy = keys(), bytes(32)
     stego = embed_derived(plain, [(own, PAYLOAD)], entropy)
     assert embed_derived(plain, [(own, PAYLOAD)], entropy).digest() == stego.digest()
-    for other in (
-        embed_derived(plain, [(own, PAYLOAD[:-1] + b"!")], entropy),
-        embed_derived(plain, [(own, PAYLOAD)]),
+    for other in (  # the salts are others, and so are the derived keys
+        embed_derived(plain, [(keys(1), PAYLOAD[:-1] + b"!")], entropy),
+        embed_derived(plain, [(keys(2), PAYLOAD)]),
     ):
         same = (read_low_bits(other, 4) == read_low_bits(stego, 4))[usable_carriers(plain, 4)].mean()
         assert same == pytest.approx(1 / 256, abs=2e-3)  # as between independent random bytes
