@@ -35,7 +35,7 @@ def test_argument_names_become_flags(message: str, expected: str) -> None:
 
 
 def test_repeated_warnings_print_once(keyss: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    def info(path: Path) -> None:
+    def info(path: Path, *, capacity: bool) -> None:
         for number in (1, 1, 2):
             warnings.warn(f"no. {number}\n`overwrite=True`", KeyssWarning, stacklevel=1)
         raise UsageError("at last")

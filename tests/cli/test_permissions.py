@@ -94,5 +94,7 @@ def test_demo_permissions(keyss: Run, tmp_path: Path, umask: None, monkeypatch: 
     result = keyss("demo", "-o", tmp_path / "demo", "--device", "cpu")
     assert result.status == 0, result.err
     assert published(tmp_path) == {"demo/publish/model.ply"}
-    assert readable_by_others(tmp_path) == {"demo/publish/model.ply", "demo/index.html"}
+    assert readable_by_others(tmp_path) == {
+        f"demo/{name}" for name in ("publish/model.ply", "index.html", "web.spz")
+    }
     assert stat.S_IMODE((tmp_path / "demo" / "private").stat().st_mode) == 0o700

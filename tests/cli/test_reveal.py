@@ -187,7 +187,7 @@ class TestVerify:
             (lambda m: m.opacity_logits.fill_(-12), "all Gaussians are invisible"),
             (
                 lambda m: [values[:300].copy_(values[300:600]) for values in vars(m).values()],
-                "equal to others",
+                "copied from others",
             ),
         ],
     )
@@ -218,8 +218,8 @@ class TestVerify:
         write_model(tmp_path / "twice.ply", model[torch.arange(len(model)).repeat(2)])
         result = keyss("verify", tmp_path / "twice.ply", "--key-file", files / "key")
         assert result.status == 4
-        assert "500 of 500 Gaussians: complete" in result.out
-        assert "equal to others" in result.err
+        assert "secret  500 of 500 Gaussians: about " in result.out
+        assert "copied from others" in result.err
 
     def test_merged_model_with_whole_secret(self, keyss: Run, files: Path, tmp_path: Path) -> None:
         merged = Gaussians.cat([read_model(files / "whole.ply"), trained_like(1500, 9)])

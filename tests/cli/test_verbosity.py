@@ -54,7 +54,7 @@ def test_verbose_prints_duration(keyss: Run, scene: Path, flag: str) -> None:
 
 
 class TestEstimate:
-    WORDS = r"about \d+ s, \d\.\d GB of memory, up to \d+ MB of disk"
+    WORDS = r"about \d+ s on the CPU, \d\.\d GB of memory, up to \d+ MB of disk"
 
     def test_fit(self, keyss: Run, scene: Path) -> None:
         result = fit(keyss, scene)
