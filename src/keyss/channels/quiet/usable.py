@@ -179,7 +179,8 @@ def _smallness(gaussians: Gaussians, layout: Layout) -> Words:
     def work(start: int, stop: int) -> Words:
         used = used_words(gaussians[start:stop])[:, layout.columns]
         below = np.where(used & 1 == 0, _LARGE_ENOUGH - _exponents(used).astype(np.int64), 0)
-        return below.max(axis=1, initial=0).astype(np.uint64)
+        smallness: Words = below.max(axis=1, initial=0).astype(np.uint64)
+        return smallness
 
     return np.concatenate([np.zeros(0, np.uint64), *in_blocks(work, len(gaussians), BLOCK)])
 

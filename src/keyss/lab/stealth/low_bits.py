@@ -336,9 +336,9 @@ def _follow(own: Words32, pairs: Integers, moved: Doubles, least: int) -> _Found
 
 
 def _joined(found: list[_Found]) -> _Found:
-    none = np.zeros((0, 2), np.int64), *(np.zeros(0, kind) for kind in (np.int64, float, np.int64, float))
-    found = [none, *found]
-    return tuple(np.concatenate(each)[:_MAX_DIFFERENCES] for each in zip(*found, strict=True))  # type: ignore[return-value]
+    index, number = np.zeros(0, np.int64), np.zeros(0)
+    every = [(np.zeros((0, 2), np.int64), index, number, index, number), *found]
+    return tuple(np.concatenate(each)[:_MAX_DIFFERENCES] for each in zip(*every, strict=True))  # type: ignore[return-value]
 
 
 def _excess(
