@@ -64,7 +64,6 @@ def _few_changes() -> list[Change]:
         random_pruning(0.1),
         *(random_pruning(0.25, draw) for draw in range(3)),
         half_floats(),
-        random_pruning(0.95),  # no secret opens
         sog.change(),
     ]
 

@@ -73,7 +73,7 @@ def test_numbers_of_every_part(page: Parsed, data: dict[str, Any]) -> None:
     psnrs += [images["models"][0]["baseline"]["mean"]["psnr"]]
     shown = [f"{psnr:.2f}" for psnr in psnrs]
     shown += [f"{data['wrong_key']['vs_secrets'][1]['max']:.2f}"]
-    shown += [f"{round(data['leaks'][1][0]['scores']['gradient'], 3) + 0.0:.3f}"]
+    shown += [f"{data['leaks'][1][0]['scores']['gradient']:z.3f}"]
     shown += [f"{parameters['sinkhorn']['sum']:.4f}", f"{parameters['score']:.2f}"]
     shown += [f"{data['stegexpose']['control']['auc']:.2f}"]
     shown += [f"{robustness[1]['secrets'][1]['psnr']:.2f}"]
