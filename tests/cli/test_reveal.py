@@ -229,6 +229,10 @@ class TestVerify:
         assert "500 of 500 Gaussians" in result.out
         assert "Gaussians were added to the file" in result.err
 
+    def test_which_of_two_keys_opens_nothing(self, keyss: Run, files: Path) -> None:
+        given = ("--key-file", files / "key", "--key-file", files / "other")
+        assert_refused(keyss("verify", files / "whole.ply", *given), 3, "key 2 of 2: this key opens nothing")
+
     def test_damaged_secret(self, keyss: Run, files: Path) -> None:
         result = keyss("verify", files / "pruned.ply", "--key-file", files / "key")
         assert result.status == 4

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from keyss.channels import open_payload
-from keyss.core.errors import KeyssWarning, UsageError
+from keyss.core.errors import KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import check_not_an_input, check_output_file, write_bytes
 from keyss.files.inputs import is_standard
@@ -112,10 +112,15 @@ def verify(
     name = "model" if isinstance(model, Gaussians) else str(model)
     gaussians = as_model(model)
     secrets = []
-    for key in [keys] if isinstance(keys, str) else keys:
+    given = [keys] if isinstance(keys, str) else keys
+    for number, key in enumerate(given, 1):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", KeyssWarning)
-            revealed = reveal_any(gaussians, key, target)
+            try:
+                revealed = reveal_any(gaussians, key, target)
+            except WrongKeyError as error:
+                which = f"key {number} of {len(given)}: " if len(given) > 1 else ""
+                raise WrongKeyError(f"{which}{error}") from error
         problems = [str(each.message) for each in caught if issubclass(each.category, KeyssWarning)]
         secrets.append(check_secret(revealed, problems))
     return Verification(name, check_model(gaussians), tuple(secrets))

@@ -86,7 +86,7 @@ class CarryMethod:
         sizes, appended, notes = capacity.sizes(secret_sizes), capacity.appended(secret_sizes), []
         if appended:
             notes.append(
-                f"about {appended:,} invisible Gaussians are appended to the cover's {capacity.gaussians:,}; "
+                f"up to {appended:,} invisible Gaussians are appended to the cover's {capacity.gaussians:,}; "
                 "fewer Gaussians or a lower SH degree of a secret take less"
             )
         else:
