@@ -55,7 +55,7 @@ def models(real_data: Path) -> dict[str, Gaussians]:
 @pytest.mark.parametrize(
     ("cover", "secret", "minimum"),
     [
-        ("inria_cuda_7000", "playbot_lod4", (80, 40)),
+        ("inria_cuda_7000", "playbot_lod4", (80, 30)),  # unnoticed, and so without its harmonics
         ("inria_cuda_7000", "inria_cuda_7000", (80, 40)),
         ("playbot_lod2", "inria_cuda_7000", (48, 50)),
         ("guitar", "playbot_lod4", (55, 45)),

@@ -159,7 +159,7 @@ test('wrong keys open nothing in colours, nor in models without them', async () 
 });
 
 test('channels report their number of derivations', async () => {
-  for (const [file, channels] of Object.entries({ 'appended.ply': 2, 'colours.spz': 2, 'carried.ply': 2 })) {
+  for (const [file, channels] of Object.entries({ 'appended.ply': 3, 'colours.spz': 2, 'carried.ply': 2 })) {
     const model = await modelOf(file);
     const prepared = preparedFor(model);
     const readers = [...prepared(false).readers, ...prepared(true).readers];
