@@ -72,7 +72,8 @@ _OVERHEAD = OVERHEAD + METHOD_BYTES + 1 + cover_sketches.BYTES
 # standard deviations by which pilots must outnumber accidental ones.
 _SAMPLE, _MAX_OFFSETS, _SIGNIFICANT = 8000, 8, 3.0
 _ASSOCIATED = b"keyss/v1/appended/data"
-# Share of foreign Gaussians that is told. No format makes any foreign; of another model, 0.95 and more are.
+# Least share of foreign Gaussians that causes a warning. Conversions make none foreign; of another model,
+# 0.95 and more are.
 _FOREIGN = 0.05
 MAX_BYTES = _MAX_PACKETS * _NARROW - OVERHEAD - METHOD_BYTES - cover_sketches.BYTES
 _VISIBLE_SECRETS = (

@@ -60,7 +60,7 @@ _ASSOCIATED = b"keyss/v1/colours"  # associated data of a payload's authenticati
 _CHANGED = 0.03  # share of carriers overwritten since
 _MAX_RATE = 4.0  # data bits per code bit; a writer stays below 0.5
 _ALIGNMENTS = 4  # offsets of log scales; the best one is wrong by at most 1/8 step in a scaled model
-_FOREIGN, _DEVIATIONS = 0.25, 4.0  # share of foreign carriers that is told; rounding reaches 0.17
+_FOREIGN, _DEVIATIONS = 0.25, 4.0  # least share of foreign carriers to warn of; rounding reaches 0.17
 _NOTHING = Header(bytes(5), ONE, 0, 63, 64, 0, 0)  # read for wrong keys, so that all keys take equally long
 
 

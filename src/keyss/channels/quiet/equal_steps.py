@@ -6,9 +6,9 @@ amount. The same holds for the distance from zero, where harmonics start, and fo
 Constant colours, which are never written, move by the same amount times the ratio of two learning rates.
 
 A Gaussian is left alone if three numbers of a group (the harmonics of a colour, a quaternion, or scales and
-opacity) moved by equal amounts away from zero or from one of its nearest neighbours, as far as the bits that
-stay tell. No rate of a trainer is assumed. By chance two
-agree in many Gaussians; whether these tell low bits is tested on each model, at each depth.
+opacity) moved by equal amounts away from zero or from one of its nearest neighbours, up to the precision of
+the bits that stay. No rate of a trainer is assumed. By chance two agree in many Gaussians; whether these
+predict low bits is tested on each model, at each depth.
 """
 
 from __future__ import annotations
