@@ -20,8 +20,8 @@ import time
 from pathlib import Path
 
 from keyss.channels import SUFFIXES, InCodes, Payload
-from keyss.channels.quiet.blocks import BlockReader
-from keyss.channels.quiet.fields import FORMATS
+from keyss.channels.lsb.blocks import BlockReader
+from keyss.channels.lsb.fields import FORMATS
 from keyss.core import Gaussians, Scene
 from keyss.files import write_bytes
 from keyss.files.formats.common import in_morton_order

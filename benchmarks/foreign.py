@@ -2,9 +2,9 @@
 
     python benchmarks/foreign.py SCENE-1.ply SCENE-2.ply OTHER-1.ply ... [--gaussians N]
 
-A note is appended to each model. Prints which share of the model its sketch takes for foreign: of the model
-after each change, of the other models (of its scene or of another, by the name before the dash), and of what
-an attacker makes of two files, so that the note of one opens in what looks like the other. Argon2id is
+A note is appended to each model. Prints which share of the model its Bloom filter takes for foreign: of the
+model after each change, of the other models (of its scene or of another, by the name before the dash), and of
+what an attacker makes of two files, so that the note of one opens in what looks like the other. Argon2id is
 replaced by a cheap function.
 
 For colours, prints how well everybody can tell carrying models from plain ones by the Gaussians of the salts:

@@ -3,7 +3,7 @@
     python benchmarks/holder.py bonsai=a.ply bonsai=b.ply fox=c.ply ...   # plain, of three scenes or more
 
 In each model, a secret is hidden alone and beside one to three others. The holder opens it, tries every cell
-of the file with the key (`tests/channels/quiet/holder.py`), and computes the statistics of
+of the file with the key (`tests/channels/lsb/holder.py`), and computes the statistics of
 `keyss.lab.stealth`. Detectors are cross-validated over scenes.
 """
 
@@ -26,8 +26,8 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from channels.quiet.holder import seen_by_holder
-from channels.quiet.trained_like import keys
+from channels.lsb.holder import seen_by_holder
+from channels.lsb.trained_like import keys
 from keyss.core import UsageError
 from keyss.lab import stealth_statistics
 from keyss.methods import most_visible

@@ -28,11 +28,11 @@ import keyss  # noqa: F401  before torch, see `ruff.toml`
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from keyss import read_model, write_model
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 
 import torch
 
-SUFFIXES = {"ply": "ply", "spz": "spz", "sog": "sog", "compressed-ply": "compressed.ply", "any": "ply"}
+SUFFIXES = {"ply": "ply", "spz": "spz", "sog": "sog", "compressed-ply": "compressed.ply", "converted": "ply"}
 
 
 def main() -> None:
@@ -113,9 +113,9 @@ with open(sys.argv[3], "wb") as file:
 def commands(folder: Path, format: str) -> dict[str, list[Any]]:
     """The measured commands by name, the floor first."""
     program, key = [sys.executable, "-m", "keyss"], ["--key-file", folder / "key.txt", "--overwrite"]
-    published = ["--publish", "any"] if format == "any" else ["--format", format]
+    published = ["--publish", "converted"] if format == "converted" else ["--format", format]
     cover, secret = folder / "cover.ply", folder / "secret.ply"
-    models = ["--cover", cover, "--secret", secret, "--refit", "never"]
+    models = ["--cover", cover, "--secret", secret, "--fine-tune", "never"]
     stego = folder / "run/publish" / f"model.{SUFFIXES[format]}"
     found = {
         "floor": [sys.executable, "-c", FLOOR, cover, secret, folder / "floor"],
@@ -125,7 +125,7 @@ def commands(folder: Path, format: str) -> dict[str, list[Any]]:
         "verify": [*program, "verify", stego],
         "reveal": [*program, "reveal", stego, *key, "-o", folder / "revealed.ply"],
     }
-    if format in ("ply", "any"):
+    if format in ("ply", "converted"):
         lost = folder / "lost.ply"
         found["reveal, 22 % lost"] = [*program, "reveal", lost, *key, "-o", folder / "revealed.ply"]
     file = ["--cover", cover, "--secret-file", folder / "letter.bin", *published, *key]

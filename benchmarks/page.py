@@ -99,7 +99,7 @@ def key_times(pairs: list[str], runs: int) -> None:
         for number, pair in enumerate(pairs):
             folder = Path(name) / str(number)
             cover, secret = pair.split(":")
-            method = CarryOptions(refit="never")
+            method = CarryOptions(fine_tune="never")
             keyss.hide(
                 cover, [keyss.Secret(secret, KEY)], method=method, width=32, min_psnr=0, out=folder / "run"
             )

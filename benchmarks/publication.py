@@ -2,9 +2,9 @@
 
     python benchmarks/publication.py RUN --key-file key.txt [--sog-iterations 10] [--only NAME ...]
 
-RUN: a folder of `keyss hide --publish any` with one secret. Each program converts the published model and the
-cover's plain model to each format; the secret is revealed from the converted file. PSNR in dB against the
-test photos.
+RUN: a folder of `keyss hide --publish converted` with one secret. Each program converts the published model
+and the cover's plain model to each format; the secret is revealed from the converted file. PSNR in dB against
+the test photos.
 
     pip install gsply
     npm install --no-save @playcanvas/splat-transform@2.7.1   (or KEYSS_SPLAT_TRANSFORM)

@@ -1,7 +1,7 @@
 """Detection of hidden content by the attacks of `keyss.lab.stealth`, on your own models.
 
     python benchmarks/stealth.py bonsai=a.ply bonsai=b.ply fox=c.ply ...  # plain, of three scenes or more
-    python benchmarks/stealth.py ... --refitted bonsai=stego.ply:secret.ply  # stego files, secrets' models
+    python benchmarks/stealth.py ... --fine-tuned bonsai=stego.ply:secret.ply  # files, secrets' models
     python benchmarks/stealth.py --pairs bonsai=plain.ply:stego.ply ...     # given files
     python benchmarks/stealth.py ... --rounded   # models like those of trainers that round steps
     python benchmarks/stealth.py ... --quick     # two random parts of each model, no predictor, no candidates
@@ -33,8 +33,8 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from channels.quiet.payloads import embed_derived
-from channels.quiet.trained_like import keys, rounded
+from channels.lsb.payloads import embed_derived
+from channels.lsb.trained_like import keys, rounded
 from keyss.core import Gaussians, UsageError
 from keyss.lab import stealth_statistics
 from keyss.methods.carry.capacity import CarryCapacity
@@ -56,7 +56,7 @@ SHOWN = 8  # single statistics in the table
 class File:
     """One file to judge; `pair` names the plain model from which it was made."""
 
-    kind: str  # "plain", "carried", "payload" (random bytes), "refitted" or "given"
+    kind: str  # "plain", "carried", "payload" (random bytes), "fine-tuned" or "given"
     scene: str
     pair: str
     model: Gaussians
@@ -83,8 +83,8 @@ def main() -> None:
             files.append(File("plain", scene, path, read_model(path)))
             files.append(File("given", scene, path, read_model(given)))
         print(f"{len(files)} files after {time.monotonic() - started:.0f} s", file=sys.stderr)
-        for scene, path, secret in map(_parse_named, options.refitted):
-            files.append(File("refitted", scene, path, read_model(path), secret))
+        for scene, path, secret in map(_parse_named, options.fine_tuned):
+            files.append(File("fine-tuned", scene, path, read_model(path), secret))
         pieces = [(file, name, piece) for file in files for name, piece in _pieces(file, options.quick)]
         rows = list(pool.map(_statistics, [piece for _, _, piece in pieces], chunksize=4))
         print(f"{len(rows)} pieces after {time.monotonic() - started:.0f} s", file=sys.stderr)
@@ -103,7 +103,7 @@ def main() -> None:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("plain", nargs="*", metavar="SCENE=FILE")
-    parser.add_argument("--refitted", nargs="*", default=[], metavar="SCENE=FILE:SECRET")
+    parser.add_argument("--fine-tuneted", nargs="*", default=[], metavar="SCENE=FILE:SECRET")
     parser.add_argument("--pairs", nargs="*", default=[], metavar="SCENE=PLAIN:STEGO")
     parser.add_argument("--rounded", action="store_true")
     parser.add_argument("--quick", action="store_true")
@@ -202,7 +202,7 @@ def _print_detections(
                 if name == piece
                 and (
                     file.kind == kind
-                    or (file.kind == "plain" and (kind == "refitted" or file.pair in paired))
+                    or (file.kind == "plain" and (kind == "fine-tuned" or file.pair in paired))
                 )
             ]
             if len({file.scene for file, _ in own}) < 3 or len({file.kind for file, _ in own}) < 2:
@@ -217,7 +217,7 @@ def _print_detections(
 
 def _print_confirmations(pool: ProcessPoolExecutor, files: Sequence[File]) -> None:
     """Print by kind and score the probability that the true candidate ranks above another one."""
-    for kind in ("carried", "refitted"):
+    for kind in ("carried", "fine-tuned"):
         own = [file for file in files if file.kind == kind and file.secret]
         own = own[:: max(1, -(-len(own) // CANDIDATES))]
         paths = list(dict.fromkeys(file.secret for file in own))

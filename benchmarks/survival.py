@@ -2,7 +2,7 @@
 
     python benchmarks/survival.py MODEL.ply [--bytes N] [--gaussians N] [--photos FOLDER] [--width PIXELS]
 
-A file of random bytes is hidden in a `.ply` (low bits) and an `.spz` (codes), and for `--publish any`
+A file of random bytes is hidden in a `.ply` (low bits) and an `.spz` (codes), and for `--publish converted`
 (colours and appended Gaussians). After each change, its key is tried. With `--photos` of its scene, the model
 is also fine-tuned. Argon2id is replaced by a cheap function, which does not affect the result.
 
@@ -26,10 +26,10 @@ import numpy as np
 
 KEY = "a key of the benchmark 4711"
 CHANNELS: dict[str, dict[str, Any]] = {
-    "low bits (`ply`)": {"publish": "as-is"},
+    "low bits (`ply`)": {"publish": "unchanged"},
     "codes (`spz`)": {"format": "spz"},
-    "colours (`any`)": {"publish": "any", "channel": "colours"},
-    "appended (`any`)": {"publish": "any", "channel": "appended"},
+    "colours (`converted`)": {"publish": "converted", "channel": "colours"},
+    "appended (`converted`)": {"publish": "converted", "channel": "appended"},
 }
 
 

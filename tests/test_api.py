@@ -26,9 +26,9 @@ from tiny_scenes import HEIGHT, WIDTH, random_gaussians, tiny_scene
 
 CONFIG = CarryOptions(
     fit=FitConfig(iterations=60, max_gaussians=300, grow_start=0.2, grow_every=20, evaluate_every=0, seed=0),
-    refit="always",
+    fine_tune="always",
 )
-ANY = replace(CONFIG, publish="any")  # so small a cover has no room
+ANY = replace(CONFIG, publish="converted")  # so small a cover has no room
 
 
 def write_nerfstudio(
@@ -181,17 +181,29 @@ def test_command_line_matches_api(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     for index, count in enumerate((1500, 700)):
         keyss.write_model(tmp_path / f"{index}.ply", random_gaussians(count, seed=index))
     cover, secret = (tmp_path / f"{index}.ply" for index in (0, 1))
-    python = CarryOptions(publish="any", refit="always").with_fit(iterations=2, seed=0)
+    python = CarryOptions(publish="converted", fine_tune="always").with_fit(iterations=2, seed=0)
     keyss.hide(cover, [Secret(secret, "the key")], method=python, width=24, out=tmp_path / "python")
     arguments = ["--cover", str(cover), "--secret", str(secret), "--width", "24", "--iterations", "2"]
     arguments += ["--seed", "0"]
     assert (
-        main(["hide", "--publish", "any", "--refit", "always", *arguments, "-o", str(tmp_path / "line")]) == 0
+        main(
+            [
+                "hide",
+                "--publish",
+                "converted",
+                "--fine-tune",
+                "always",
+                *arguments,
+                "-o",
+                str(tmp_path / "line"),
+            ]
+        )
+        == 0
     )
     for name in ("private/config.json", "publish/model.ply"):
         assert (tmp_path / "line" / name).read_bytes() == (tmp_path / "python" / name).read_bytes(), name
     config = json.loads((tmp_path / "line" / "private" / "config.json").read_text())["options"]
-    assert (config["refits"], config["fit"]["iterations"]) == ([2], 2)
+    assert (config["fine_tuning_steps"], config["fit"]["iterations"]) == ([2], 2)
 
 
 def _signatures() -> str:
@@ -242,10 +254,10 @@ def test_preset() -> None:
     """As on the command line; options have their own schedule."""
     chosen = [keyss.Secret(tiny_scene(1), "a key of a secret scene")]
     for name in ("quick", "default"):
-        found = keyss.hide(tiny_scene(), chosen, preset=name, publish="any", dry_run=True).cost
+        found = keyss.hide(tiny_scene(), chosen, preset=name, publish="converted", dry_run=True).cost
         options = CarryOptions.preset(name)
         assert found is not None
-        expected = keyss.hide(tiny_scene(), chosen, method=options, publish="any", dry_run=True).cost
+        expected = keyss.hide(tiny_scene(), chosen, method=options, publish="converted", dry_run=True).cost
         assert expected is not None
         assert found.steps == expected.steps
     with pytest.raises(UsageError, match="expected quick or default or full"):

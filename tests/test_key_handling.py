@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from cli.harness import SMALL, write_workspace
-from keyss.channels import QuietReader
+from keyss.channels import LsbReader
 from keyss.cli import command_table, entry, main
 from keyss.core import KeyssError
 from keyss.keys import DerivedKey
@@ -61,7 +61,16 @@ def test_key_is_never_written_or_printed(
     folder = write_workspace(tmp_path)
     run, key = folder / "run", ["--key-file", str(folder / "key.txt")]
     (folder / "key.txt").chmod(0o644)  # triggers a warning
-    scenes = ["--cover", str(folder / "a"), "--secret", str(folder / "b"), "--publish", "any", "-o", str(run)]
+    scenes = [
+        "--cover",
+        str(folder / "a"),
+        "--secret",
+        str(folder / "b"),
+        "--publish",
+        "converted",
+        "-o",
+        str(run),
+    ]
     with monkeypatch.context() as patch:
         patch.setattr("keyss.progress.reporter", _InterruptHiding)
         assert main(["hide", *scenes, *key, *SMALL]) == 130
@@ -114,5 +123,5 @@ def test_repr_and_errors_omit_key() -> None:
     assert KEY not in repr(derived)
     assert derived.expand("writer", 32).hex() not in repr(derived)
     with pytest.raises(KeyssError) as caught:
-        QuietReader.of(trained_like(50)).open(KEY)
+        LsbReader.of(trained_like(50)).open(KEY)
     assert not _contains_key(str(caught.value).encode())

@@ -36,7 +36,7 @@ def test_hide_and_reveal_without_unix_only_apis(folders: tuple[Path, Path], tmp_
         assert done.returncode == 0, done.stderr
 
     cover, secret = folders
-    scenes = ("--cover", cover, "--secret", secret, "--publish", "any", "--min-psnr", 0)
+    scenes = ("--cover", cover, "--secret", secret, "--publish", "converted", "--min-psnr", 0)
     keyss("hide", *scenes, "--key-file", "key.txt", "-o", "out", *SMALL)
     stego = tmp_path / "out" / "publish" / "model.ply"
     keyss("reveal", stego, "--key-file", "key.txt", "-o", "secret.ply", "--device", "cpu")

@@ -10,7 +10,7 @@ import pytest
 from files.scene_files import write_blender, write_nerfstudio
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
-SHORT = 'method=keyss.CarryOptions(publish="any").with_fit(iterations=10, max_gaussians=100), width=200'
+SHORT = 'method=keyss.CarryOptions(publish="converted").with_fit(iterations=10, max_gaussians=100), width=200'
 
 
 def test_python_example(

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import keyss
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from fitting.test_plain import InterruptAt
 from keyss import CarryOptions, FitConfig, Gaussians, Secret
-from keyss.channels import AppendedReader, QuietReader, is_appended
+from keyss.channels import AppendedReader, LsbReader, is_appended
 from keyss.core import Interrupted, OutputError, WrongKeyError
 from keyss.keys import DerivedKey, derivation
 from keyss.methods import MethodOptions
@@ -25,8 +25,8 @@ FIT = FitConfig(iterations=20, max_gaussians=300, grow_start=0.2, grow_every=5, 
 KEY = "a key of many characters: 93hXmQ2"
 JOINT = small("published", FIT)
 # Appended Gaussians: whether so small a cover has room in low bits depends on the processor.
-CARRIED = CarryOptions(fit=FIT, publish="any")
-METHODS = [replace(CARRIED, refit="always"), CARRIED]
+CARRIED = CarryOptions(fit=FIT, publish="converted")
+METHODS = [replace(CARRIED, fine_tune="always"), CARRIED]
 
 
 def _hide(options: MethodOptions) -> Gaussians:
@@ -49,7 +49,7 @@ def _interrupted_seed(run: Path, *names: str) -> int:
     return found
 
 
-@pytest.mark.parametrize("options", METHODS, ids=["refitted", "carried"])
+@pytest.mark.parametrize("options", METHODS, ids=["fine-tuned", "carried"])
 def test_repeated_hidings_share_no_rotation(options: MethodOptions) -> None:
     one, two = (_rotations(_hide(options)) for _ in range(2))
     assert min(len(one), len(two)) > 100
@@ -79,13 +79,13 @@ def test_salts_differ_for_equal_seeds(options: MethodOptions) -> None:
         stegos.append(hidden.stego)
     common = salts[0] & salts[1]
     for own, stego in zip(salts, stegos, strict=True):
-        readers = [each for each in (QuietReader.of(stego), AppendedReader.of(stego)) if each]
+        readers = [each for each in (LsbReader.of(stego), AppendedReader.of(stego)) if each]
         assert common <= {salt for each in readers for salt in each.salts}
         assert not any(_opens(each, salt) for each in readers for salt in common)
         assert any(_opens(each, salt) for each in readers for salt in own)
 
 
-def _opens(reader: QuietReader | AppendedReader, salt: bytes) -> bool:
+def _opens(reader: LsbReader | AppendedReader, salt: bytes) -> bool:
     try:
         reader.extract(DerivedKey.of(KEY, salt))
     except WrongKeyError:

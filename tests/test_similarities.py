@@ -58,7 +58,7 @@ def test_distant_scene_is_recentred(tmp_path: Path) -> None:
         assert (scene.to_scene_frame(model).means - local.means).abs().max() < 1  # single precision far out
 
 
-@pytest.mark.parametrize(("publish", "scale"), [("as-is", 1e-4), ("as-is", 1e6), ("any", 1e6)])
+@pytest.mark.parametrize(("publish", "scale"), [("unchanged", 1e-4), ("unchanged", 1e6), ("converted", 1e6)])
 def test_hide_at_any_scale(publish: str, scale: float) -> None:
     cover = Similarity(scale).apply_gaussians(random_gaussians(2500, seed=1))
     noise = torch.Generator().manual_seed(0)
@@ -75,4 +75,4 @@ def test_distant_model_is_refused() -> None:
         random_gaussians(500)
     )
     with pytest.raises(UsageError, match=r"splat-transform .* -t 45678"):
-        keyss.hide(cover, [Secret(random_gaussians(20), KEY)], publish="any", width=24)
+        keyss.hide(cover, [Secret(random_gaussians(20), KEY)], publish="converted", width=24)

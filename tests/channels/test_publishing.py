@@ -6,7 +6,7 @@ import warnings
 
 import pytest
 
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from keyss.channels import APPENDED, LOW_BITS, Channel, Payload, open_payload
 from keyss.core import Gaussians, KeyssWarning
 

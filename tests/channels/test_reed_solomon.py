@@ -80,7 +80,7 @@ def test_codewords_with_different_losses_on_one_thread_and_on_many(codewords: Co
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 40), st.integers(0, 12), st.integers(0, 20), st.integers(0, 2**32 - 1))
-def test_an_error_costs_two_chunks(k: int, wrong: int, lost: int, seed: int) -> None:
+def test_an_error_costs_two_shards(k: int, wrong: int, lost: int, seed: int) -> None:
     random, codewords = np.random.default_rng(seed), Codewords(1, k + 2 * wrong + lost, k, WIDTH)
     data = random.bytes(codewords.size)
     left = random.permutation(codewords.n)[lost:]
@@ -102,15 +102,15 @@ def test_long_codewords_with_losses_and_errors() -> None:
     random = np.random.default_rng(5)
     codewords = Codewords(1, 8192, 5895, 8)
     data = random.bytes(codewords.size)
-    chunks = codewords.encode(data)
-    numbers = random.permutation(codewords.chunks)[: round(0.75 * codewords.chunks)]
-    left = chunks[numbers]
+    shards = codewords.encode(data)
+    numbers = random.permutation(codewords.shards)[: round(0.75 * codewords.shards)]
+    left = shards[numbers]
     left[:60] = random.integers(0, 256, (60, 8))
     assert codewords.decode(numbers, left) != data
     assert codewords.decode(numbers, left, errors=True) == data
     twice = np.concatenate([numbers, numbers[60:100]]), np.concatenate([left, left[:40]])
     assert codewords.decode(*twice, errors=True) == data  # both of two that differ are left out
-    with pytest.raises(InputError, match="4,500 of 8,192 chunks are left"):
+    with pytest.raises(InputError, match="4,500 of 8,192 shards are left"):
         codewords.decode(numbers[:4500], left[:4500], errors=True)
 
 

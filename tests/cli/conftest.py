@@ -21,7 +21,9 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _make_workspace(folder: Path) -> None:
     write_key(write_workspace(folder) / "wrong.txt", "fedcba9876543210")
     scenes = ("--cover", folder / "a", "--secret", folder / "b", "--key-file", folder / "key.txt")
-    assert main(["hide", "--publish", "any", *map(str, scenes), "-o", str(folder / "hidden"), *SMALL]) == 0
+    assert (
+        main(["hide", "--publish", "converted", *map(str, scenes), "-o", str(folder / "hidden"), *SMALL]) == 0
+    )
 
 
 @pytest.fixture

@@ -95,9 +95,9 @@ def test_method_options(keyss: Run, hide_calls: list[Any]) -> None:
     assert keyss(*scenes, "--method", "keyss", "--design", "published", *clip).status == 0
     joint = hide_calls[0][1]["method"]
     assert (joint.design, joint.key_encoder, joint.clip_model) == ("published", "clip", "C")
-    assert keyss(*scenes, "--refit", "never", "--seed", 5).status == 0
+    assert keyss(*scenes, "--fine-tune", "never", "--seed", 5).status == 0
     carry = hide_calls[1][1]["method"]
-    assert (carry.refit, carry.fit.seed) == ("never", 5)
+    assert (carry.fine_tune, carry.fit.seed) == ("never", 5)
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_invalid_values(keyss: Run, hide_calls: list[Any], extra: tuple[object, 
 def test_options_without_effect(
     keyss: Run, hide_calls: list[Any], extra: tuple[object, ...], words: str
 ) -> None:
-    carry = ("hide", "--refit", "never", "-o", "out", *extra)
+    carry = ("hide", "--fine-tune", "never", "-o", "out", *extra)
     assert_refused(keyss(*carry, "--cover", "a.ply", "--secret", "b.ply"), 2, words)
     models = ("--cover-model", "a.ply", "--secret-model", "b.ply")
     assert_refused(keyss(*carry, "--cover", "A", "--secret", "B", *models), 2, words)

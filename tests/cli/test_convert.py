@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import keyss as package
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from cli.harness import Run, assert_refused, write_key
 from keyss.core import Similarity
 from keyss.files import read_model, write_model
@@ -50,9 +50,7 @@ def test_reports_quality(keyss: Run, files: Path, tmp_path: Path, suffix: str) -
             assert 25 < psnr < 100
         if suffix == "spz":
             assert others.pop(0).startswith("y is up in an .spz")
-        assert others == [
-            "what was hidden with --publish as-is, if anything, is lost; --key-file checks a secret"
-        ]
+        assert others == ["secrets of --publish unchanged, if any, are lost; --key-file checks one"]
     assert len(read_model(out)) == COUNT
 
 
@@ -177,7 +175,7 @@ def test_low_bits_beside_appended_gaussians_must_not_be_converted(
     write_model(tmp_path / "cover.ply", trained_like(1500))
     write_model(tmp_path / "secret.ply", trained_like(20, 1))
     cover = tmp_path / "cover.ply"
-    for name, publish, how in (("a", "any", "; it may be converted"), ("b", "as-is", " unchanged")):
+    for name, publish, how in (("a", "converted", "; it may be converted"), ("b", "unchanged", " unchanged")):
         scenes = ("--cover", cover, "--secret", tmp_path / "secret.ply", "--key-file", files / "key")
         options = ("--publish", publish, "--width", 24, "--min-psnr", 0)
         result = keyss("hide", *scenes, *options, "-o", tmp_path / name)

@@ -10,7 +10,7 @@ from cli.harness import SMALL, Run, listing, scene_arguments
 
 def test_dry_run(keyss: Run, workspace: Path, tmp_path: Path) -> None:
     scenes = scene_arguments(workspace)
-    result = keyss("hide", "--publish", "any", *scenes, "-o", tmp_path / "out", *SMALL, "--dry-run")
+    result = keyss("hide", "--publish", "converted", *scenes, "-o", tmp_path / "out", *SMALL, "--dry-run")
     assert result.status == 0, result.err
     for words in ("capacity ", "time ", "memory ", "disk "):
         assert words in result.out, words
@@ -19,5 +19,5 @@ def test_dry_run(keyss: Run, workspace: Path, tmp_path: Path) -> None:
     assert listing(tmp_path) == {}
     result = keyss("hide", *scenes, "-o", tmp_path / "out", *SMALL, "--dry-run")
     assert result.status == 0
-    assert "--publish any has room" in result.err  # too few for low bits
+    assert "--publish converted has room" in result.err  # too few for low bits
     assert listing(tmp_path) == {}

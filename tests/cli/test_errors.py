@@ -38,14 +38,20 @@ def _hide(folder: Path, **changes: object) -> list[object]:
     options |= {"--out": folder / "out"} | {
         f"--{name.replace('_', '-')}": value for name, value in changes.items()
     }
-    return ["hide", "--publish", "any", *(part for option in options.items() for part in option), *SMALL]
+    return [
+        "hide",
+        "--publish",
+        "converted",
+        *(part for option in options.items() for part in option),
+        *SMALL,
+    ]
 
 
 def _hide_models(folder: Path, *extra: object, **changes: object) -> list[object]:
     files = {"cover": _private_model(folder, "cover"), "secret": _private_model(folder, "secret-1")}
     files |= {"out": folder / "out", "key_file": folder / "key.txt"} | changes
     options = [part for name, value in files.items() for part in (f"--{name.replace('_', '-')}", value)]
-    return ["hide", "--publish", "any", *options, *extra]
+    return ["hide", "--publish", "converted", *options, *extra]
 
 
 def _link_loop(folder: Path) -> Path:

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import cheap_keys
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from cli.harness import write_workspace
 from keyss.files import write_model
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import keyss as library
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from cli.harness import SMALL, Run, scene_arguments, write_key
 from keyss.files import write_model
 
@@ -44,12 +44,12 @@ def test_cover_without_harmonics(keyss: Run) -> None:
     assert "whoever inspects the published file sees that it holds something" in shown.err.splitlines()[0]
     refused = keyss(*flat, "--secret", "small.ply", "--format", "ply", "-o", "run")
     assert refused.status == 7  # few low bits, for a few Gaussians of the secret
-    assert "--publish any keeps all of them" in refused.err
+    assert "--publish converted keeps all of them" in refused.err
 
 
 def test_hide_from_few_photos(keyss: Run, workspace: Path) -> None:
     few = [word if word != "100" else "1200" for word in SMALL]
-    result = keyss("hide", *scene_arguments(workspace), *few, "--refit", "always", "-o", "run")
+    result = keyss("hide", *scene_arguments(workspace), *few, "--fine-tune", "always", "-o", "run")
     assert result.status == 0, result.err
-    assert "refit of the secret" in result.err
+    assert "fine-tuning of the secret" in result.err
     assert keyss("verify", "run/publish/model.ply", "--key-file", "key.txt").status == 0

@@ -11,7 +11,7 @@ from hypothesis import given, strategies as st
 
 import keyss as library
 from channels.colours.made import cover
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from cli.harness import Run, assert_refused, listing, write_key
 from keyss import read_model, write_model
 from keyss.channels import Payload
@@ -68,10 +68,10 @@ def test_file_from_a_pruned_model(keyss: Run, folder: Path, tmp_path: Path) -> N
     arguments = (tmp_path / "pruned.ply", "--key-file", folder / "key0")
     verified = keyss("verify", *arguments)
     assert verified.status == 4
-    assert "chunks of the secret's payload were lost, and restored" in verified.err
+    assert "shards of the secret's payload were lost, and restored" in verified.err
     revealed = keyss("reveal", *arguments, "-o", tmp_path / "file.bin")
     assert revealed.status == 0
-    assert "chunks of the secret's payload were lost, and restored" in revealed.err
+    assert "shards of the secret's payload were lost, and restored" in revealed.err
     assert (tmp_path / "file.bin").stat().st_size == 3000
 
 
@@ -115,7 +115,7 @@ def test_hidden_file_survives_conversion(keyss: Run, folder: Path, tmp_path: Pat
     (tmp_path / "note.txt").write_text("Meet me at the golden knot. " * 20)
     key, out = ("--key-file", folder / "key0"), tmp_path / "out"
     hide = ("hide", "--cover", tmp_path / "cover.ply", "--secret-file", tmp_path / "note.txt", *key)
-    result = keyss(*hide, "--publish", "any", "-o", out)
+    result = keyss(*hide, "--publish", "converted", "-o", out)
     assert (result.status, result.err) == (0, "")
     assert "may be converted" in result.out
     result = keyss("convert", out / "publish" / "model.ply", tmp_path / "web.spz", *key)

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 import keyss as library
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from cli.harness import SMALL, Run
 from files.scene_files import write_nerfstudio
 from keyss.files import load_scene, write_model
@@ -75,4 +75,4 @@ def test_capacity(keyss: Run, tmp_path: Path) -> None:
     assert re.search(r"capacity +--format ply: \d+,\d+ bytes, a model of about \d+,?\d* Gaussians", out)
     for words in ("--format spz: ", "--format sog: ", "--format compressed-ply: ", "--channel colours: "):
         assert words in out
-    assert "--publish any: any secret" in out
+    assert "--publish converted: any secret" in out

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from cli.harness import Run, assert_refused, write_key
 from keyss.cli import keys
 from keyss.core import InputError, KeyssWarning, UsageError

@@ -38,7 +38,7 @@ SCENES = "--cover a --secret b --key-file key.txt"
 COMMANDS: Mapping[str, Command] = {
     "fit": Command(f"fit a -o OUT {SIZE}", "--resume", results=("model.ply", "private/config.json")),
     "hide": Command(
-        f"hide {SCENES} --publish any --min-psnr=0 -o OUT {SIZE}",
+        f"hide {SCENES} --publish converted --min-psnr=0 -o OUT {SIZE}",
         "--resume",
         results=("publish/model.ply", "private/cover.ply", "private/secret-1.ply"),
         numbers=("private/metrics.json",),

@@ -11,7 +11,7 @@ import pytest
 from numpy.lib.recfunctions import append_fields, repack_fields
 from plyfile import PlyData, PlyElement
 
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from cli.harness import SMALL, Run, write_key
 from files.scene_files import HEIGHT, WIDTH, save, write_colmap
 from keyss.files import read_model, write_model

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from cli.harness import SMALL, Run
 from files.scene_files import write_blender, write_nerfstudio
 from keyss.demo import OPTIONS, run_demo
@@ -37,7 +37,7 @@ def run_all_commands(keyss: Run) -> None:
     small = " ".join(SMALL)
     run("keygen -o key.txt")
     run(f"fit a -o plain {small}")
-    run(f"hide --publish any --cover a --secret b --key-file key.txt --min-psnr=0 -o hidden {small}")
+    run(f"hide --publish converted --cover a --secret b --key-file key.txt --min-psnr=0 -o hidden {small}")
     models = "--cover own/cover.ply --secret own/secret.ply --width 16 --device cpu"
     run(f"hide --method carry {models} --key-file key.txt -o carried")
     for name in ("hidden", "carried"):

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from cli.harness import SMALL, Run, assert_refused, scene_arguments, write_key
 from keyss.files import read_model, write_model
 
 
 def test_min_psnr(keyss: Run, workspace: Path, tmp_path: Path) -> None:
-    hide = ["hide", *scene_arguments(workspace), "--publish", "any", "-o", tmp_path / "run", *SMALL]
+    hide = ["hide", *scene_arguments(workspace), "--publish", "converted", "-o", tmp_path / "run", *SMALL]
     result = keyss(*hide, "--min-psnr", 90)
     assert result.status == 7
     assert "below 90 dB: nothing was published; a lower --min-psnr" in result.err

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 import torch
 
-from channels.quiet.coded import codes_of, model_of
-from channels.quiet.trained_like import trained_like
+from channels.lsb.coded import codes_of, model_of
+from channels.lsb.trained_like import trained_like
 from cli.harness import PROGRAM, Result, Run, assert_refused, listing, write_key
 from keyss.channels import LOW_BITS, CodesCover, Payload, base
 from keyss.channels.colours import carriers
-from keyss.channels.quiet import cells
+from keyss.channels.lsb import cells
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
 from keyss.keys import DerivedKey
@@ -71,7 +71,7 @@ class TestCounts:
     def test_restored_secret_warning(self, reveal: Run, tmp_path: Path) -> None:
         result = reveal("pruned.ply")
         assert (result.status, result.out) == (0, f"{tmp_path}/s.ply: 500 of 500 Gaussians\n")
-        assert re.match(r"keyss: warning: \d+ of [\d,]+ chunks .* were lost, and restored", result.err)
+        assert re.match(r"keyss: warning: \d+ of [\d,]+ shards .* were lost, and restored", result.err)
         assert len(result.err.splitlines()) == 1
 
     def test_lost_secret(self, reveal: Run, tmp_path: Path) -> None:
@@ -236,7 +236,7 @@ class TestVerify:
     def test_damaged_secret(self, keyss: Run, files: Path) -> None:
         result = keyss("verify", files / "pruned.ply", "--key-file", files / "key")
         assert result.status == 4
-        assert "chunks of the secret's payload were lost, and restored" in result.err
+        assert "shards of the secret's payload were lost, and restored" in result.err
         assert_refused(
             keyss("verify", files / "few.ply", "--key-file", files / "key"), 4, "was lost or changed"
         )

@@ -62,7 +62,7 @@ class TestEstimate:
         assert "about" not in fit(keyss, scene, "-q", "--overwrite").err
 
     def test_hide(self, keyss: Run, workspace: Path, tmp_path: Path) -> None:
-        hide = ("hide", *scene_arguments(workspace), "--publish", "any", "-o", tmp_path / "out")
+        hide = ("hide", *scene_arguments(workspace), "--publish", "converted", "-o", tmp_path / "out")
         result = keyss(*hide, *SMALL, "--min-psnr", 0)
         assert result.status == 0, result.err
         assert re.search(rf"^hide: a file of up to \d+\.\d MB, {self.WORDS}\n", result.err, re.MULTILINE)

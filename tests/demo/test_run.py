@@ -17,7 +17,7 @@ from keyss.runs import HideMetrics, read_record
 
 SMALL: dict[str, Any] = {
     # So small a model has no room in low bits.
-    "options": CarryOptions(fit=FitConfig(iterations=30, max_gaussians=300), publish="any"),
+    "options": CarryOptions(fit=FitConfig(iterations=30, max_gaussians=300), publish="converted"),
     "width": 32,
     "device": "cpu",
 }

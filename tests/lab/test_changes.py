@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from keyss.core import BackendError, Gaussians, Scene, UsageError
 from keyss.fitting import mean_psnr
 from keyss.lab import (

@@ -23,7 +23,7 @@ from keyss.lab import (
 )
 from keyss.methods import HiddenScene, open_model
 from lab.known_scene import Whole
-from methods.carry.test_refit import TINY
+from methods.carry.test_fine_tuning import TINY
 from methods.hiding import hide_scenes, moved, three_scenes
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -91,13 +91,13 @@ def pair() -> tuple[list[Scene], list[Gaussians]]:
     return [scenes[0], scenes[2]], [random_gaussians(1500, seed=0), random_gaussians(200, seed=2)]
 
 
-@pytest.mark.parametrize("publish", ["as-is", "any"])
-def test_refitted_secret_after_changes(
-    publish: Literal["as-is", "any"], pair: tuple[list[Scene], list[Gaussians]]
+@pytest.mark.parametrize("publish", ["unchanged", "converted"])
+def test_fine_tuned_secret_after_changes(
+    publish: Literal["unchanged", "converted"], pair: tuple[list[Scene], list[Gaussians]]
 ) -> None:
     scenes, models = pair
     config = CarryOptions(
-        fit=replace(TINY, iterations=5, max_gaussians=2000, boost=1.0), publish=publish, refit="always"
+        fit=replace(TINY, iterations=5, max_gaussians=2000, boost=1.0), publish=publish, fine_tune="always"
     )
     hidden = hide_scenes(scenes, [KEY], config, plains=models)
     revealed = keyss.reveal(hidden.stego, KEY).gaussians
@@ -105,18 +105,18 @@ def test_refitted_secret_after_changes(
 
     changes = [random_pruning(0.1), half_floats(), purification(scenes[0], steps=0)]
     _, pruned, rounded, purified = measure_robustness(hidden.stego, [opener], scenes, changes=changes)
-    if publish == "as-is":
-        with pytest.warns(KeyssWarning, match="chunks of the secret's payload were lost, and restored"):
+    if publish == "unchanged":
+        with pytest.warns(KeyssWarning, match="shards of the secret's payload were lost, and restored"):
             keyss.reveal(changes[0](hidden.stego), KEY)
     assert pruned.secrets[0].opens
     assert pruned.secrets[0].psnr == mean_psnr(revealed, scenes[1].test, scenes[1].background)
-    assert rounded.secrets[0].opens == (publish == "any")
-    if publish == "any":
+    assert rounded.secrets[0].opens == (publish == "converted")
+    if publish == "converted":
         assert rounded.secrets[0].loss == 0
     else:
         assert rounded.secrets[0].error == "this key opens nothing here"
         assert rounded.secrets[0].loss > 10
     assert purified.cover is not None
     assert abs(purified.cover.loss) < 0.1
-    if publish == "any":
+    if publish == "converted":
         assert purified.secrets[0].loss > 10  # appended Gaussians are not seen in the cover

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import keyss
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from cli.harness import Run, assert_refused
 from keyss import Gaussians, Secret
 from keyss.channels import LOW_BITS, Payload

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from fitting.small_trainings import FIT, training
 from keyss import CarryOptions, Secret, hide, reveal
 from keyss.methods import DESIGNS, registry

@@ -39,12 +39,12 @@ def test_bound_has_equal_steps(
     folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     counts = count_steps(monkeypatch)
-    options = CarryOptions(fit=FIT, publish="any", refit="always", iterations=30)
+    options = CarryOptions(fit=FIT, publish="converted", fine_tune="always", iterations=30)
     result = keyss.hide(
         folders[0], [Secret(folders[1], KEY)], method=options, bound=True, min_psnr=0, out=tmp_path / "run"
     )
     steps = list(counts.values())
-    assert steps == [40, 40, 30, 70]  # cover, secret, refit of the secret, bound
+    assert steps == [40, 40, 30, 70]  # cover, secret, fine-tuning of the secret, bound
     metrics = result.metrics
     assert metrics.steps == metrics.baseline.steps == (steps[0], steps[1] + steps[2]) == (40, steps[3])
     assert metrics.baseline.equal == (True, True)
@@ -61,7 +61,7 @@ def test_shorter_fit_is_no_bound(
     counts = count_steps(monkeypatch)
     fitted = keyss.fit(folders[1], config=replace(FIT, iterations=25), out=tmp_path / "plain")
     secret = Secret(folders[1], KEY, tmp_path / "plain" / "model.ply")
-    options = CarryOptions(fit=FIT, publish="any", refit="always")
+    options = CarryOptions(fit=FIT, publish="converted", fine_tune="always")
     metrics = keyss.hide(folders[0], [secret], method=options, min_psnr=0).metrics
     assert list(counts.values()) == [25, 40, 46]
     assert metrics.steps == (40, 71)  # recorded by `keyss fit`
@@ -72,6 +72,6 @@ def test_shorter_fit_is_no_bound(
     assert metrics.steps == (40, None)
     assert metrics.baseline.equal == (True, False)
     carried = keyss.hide(
-        folders[0], [unknown], method=CarryOptions(fit=FIT, publish="any"), bound=True, min_psnr=0
+        folders[0], [unknown], method=CarryOptions(fit=FIT, publish="converted"), bound=True, min_psnr=0
     ).metrics
-    assert carried.baseline.equal == (True, True)  # no refit
+    assert carried.baseline.equal == (True, True)  # no fine-tuning

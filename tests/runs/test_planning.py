@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import keyss
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.core import OutputError
 from keyss.files import write_model
@@ -52,17 +52,17 @@ def test_steps_with_networks_take_longer() -> None:
 
 def test_bound_takes_longer() -> None:
     secret, seconds = Secret(tiny_scene(1), KEY), []
-    options = CarryOptions(fit=FIT, iterations=90, publish="any", refit="always")
+    options = CarryOptions(fit=FIT, iterations=90, publish="converted", fine_tune="always")
     for bound in (False, True):
         cost = keyss.hide(tiny_scene(0), [secret], method=options, bound=bound, dry_run=True).cost
         seconds.append(cost.seconds)
-    # Of the secret: 60 steps of its plain model, and 90 refit steps.
+    # Of the secret: 60 steps of its plain model, and 90 of fine-tuning.
     assert seconds[1] - seconds[0] == pytest.approx(cost.fit_seconds[1] * 150 / 60)
 
 
 def test_capacity(tmp_path: Path) -> None:
     cover, secret = trained_like(2500), trained_like(6000, 2)
-    options = CarryOptions(refit="never")
+    options = CarryOptions(fine_tune="never")
     found = keyss.hide(cover, [Secret(secret, KEY)], method=options, width=24, dry_run=True)
     plan = found.plan
     result = keyss.hide(cover, [Secret(secret, KEY)], method=options, width=24, min_psnr=0)

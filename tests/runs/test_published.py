@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import keyss
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from fitting.test_plain import InterruptAt
 from keyss import CarryOptions, FitConfig, Gaussians, Secret
 from keyss.core import Interrupted
@@ -23,8 +23,8 @@ pytestmark = pytest.mark.usefixtures("umask")
 KEY = "a key of many characters: 93hXmQ2"
 FIT = FitConfig(iterations=4, max_gaussians=1600, evaluate_every=0)
 METHODS = {
-    "refitted": CarryOptions(fit=FIT, iterations=4, refit="always"),
-    "carried for any format": CarryOptions(fit=FIT, publish="any"),
+    "fine-tuned": CarryOptions(fit=FIT, iterations=4, fine_tune="always"),
+    "carried for any format": CarryOptions(fit=FIT, publish="converted"),
     "keyss": small("published", replace(FIT, iterations=16, seed=2_718_281_828)),
     "carry": CarryOptions(fit=FIT),
 }
@@ -80,7 +80,7 @@ def test_published_file_does_not_identify_secret(tmp_path: Path, method: str) ->
 
 def test_checkpoints_are_private(tmp_path: Path) -> None:
     with pytest.raises(Interrupted):
-        _hide(tmp_path, METHODS["refitted"], reporter=InterruptAt(2))
+        _hide(tmp_path, METHODS["fine-tuned"], reporter=InterruptAt(2))
     run = tmp_path / "run"
     modes = _modes(run / "private")
     assert any("checkpoint" in name and name.endswith(".safetensors") for name in modes)

@@ -30,11 +30,11 @@ from cryptography.hazmat.primitives.hashes import SHA256  # noqa: E402
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
-from channels.quiet import coded  # noqa: E402
-from channels.quiet.trained_like import trained_like  # noqa: E402
+from channels.lsb import coded  # noqa: E402
+from channels.lsb.trained_like import trained_like  # noqa: E402
 from files.formats.examples import model_of, random_compressed, random_sog, random_spz  # noqa: E402
 from keyss.channels import LOW_BITS, SUFFIXES, Payload, channel_for, in_counted_order, last_bits, open_payload  # noqa: E402
-from keyss.channels.quiet.fields import _log2  # noqa: E402
+from keyss.channels.lsb.fields import _log2  # noqa: E402
 from keyss.core.gaussians import Gaussians  # noqa: E402
 from keyss.core.similarity import Similarity  # noqa: E402
 from keyss.files import read_model, write_model  # noqa: E402
@@ -54,7 +54,7 @@ from vectors.surviving import NAMES, write_surviving  # noqa: E402
 def cell() -> dict[str, object]:
     """A cell as in docs/byte-layout.md, by the cipher modes of `cryptography`."""
     secret, carrier_id = bytes(range(32)), bytes(range(16))
-    label, data, tag_bytes = "chunk", b"\x02\x01\x00chunk", 4
+    label, data, tag_bytes = "shard", b"\x02\x01\x00shard", 4
 
     def key(use: str) -> bytes:
         return HKDFExpand(SHA256(), 32, f"keyss/v1/{label}/{use}".encode()).derive(secret)
@@ -81,7 +81,7 @@ def derivation() -> dict[str, object]:
     for vector in vectors["valid"]:
         key, salt = unicodedata.normalize("NFKC", vector["key"]).encode(), bytes.fromhex(vector["salt"])
         master = hash_secret_raw(key, salt, 3, 64 * 1024, 4, 32, Type.ID)
-        for label in ("writer", "quiet/key"):
+        for label in ("writer", "lsb/key"):
             expand = HKDFExpand(SHA256(), 32, f"keyss/v1/{label}".encode())
             vector[label] = expand.derive(master).hex()
     return vectors
@@ -95,8 +95,8 @@ def open_file(name: str, key: str) -> dict[str, Any]:
     if payload.method != "carry":
         return found | {"payload": hashlib.sha256(payload.data).hexdigest()}
     model = CarriedSecret.of(payload).reveal(stego)
-    chunks = payload.chunks and list(payload.chunks)
-    return found | {"count": len(model), "chunks": chunks, "sha256": digests(model)}
+    shards = payload.shards and list(payload.shards)
+    return found | {"count": len(model), "shards": shards, "sha256": digests(model)}
 
 
 def pruned_model() -> Gaussians:
@@ -173,7 +173,7 @@ def write_coded(suffix: str) -> None:
     }[suffix]
     secrets = [(TWO_KEYS[0], Payload("carry", encode(trained_like(40, 14, 1)))), (TWO_KEYS[1], other)]
     name = next(each for each, end in SUFFIXES.items() if end == suffix)
-    model = channel_for("as-is", format=name).prepare(cover).embed(secrets, entropy=bytes(32))
+    model = channel_for("unchanged", format=name).prepare(cover).embed(secrets, entropy=bytes(32))
     write_model(FOLDER / f"coded{suffix}", model)
 
 
@@ -183,7 +183,9 @@ def write_decoded(suffix: str) -> None:
     model = codes.dequantise()
     payload = HiddenFile("a note.txt", b"Written at night, read at noon.\n").payload()
     stego = (
-        channel_for("as-is", cover=model).prepare(model).embed([(TWO_KEYS[0], payload)], entropy=bytes(32))
+        channel_for("unchanged", cover=model)
+        .prepare(model)
+        .embed([(TWO_KEYS[0], payload)], entropy=bytes(32))
     )
     write_model(FOLDER / f"decoded-{suffix.split('.')[1]}.ply", stego)
 

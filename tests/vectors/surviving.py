@@ -12,7 +12,7 @@ from unittest import mock
 import torch
 from scipy.spatial.transform import Rotation
 
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from keyss.channels import APPENDED, COLOURS, Payload
 from keyss.channels.colours import planner
 from keyss.core.errors import KeyssWarning

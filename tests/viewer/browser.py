@@ -18,7 +18,7 @@ import pytest
 import torch
 from PIL import Image
 
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from keyss.core import Camera, Gaussians
 from keyss.rendering import render
 

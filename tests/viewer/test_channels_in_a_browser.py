@@ -35,7 +35,7 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]
     @cache
     def stego(kind: str) -> Path:
         format = PUBLISHED.get(kind)
-        channel = channel_for("as-is" if format else "any", format=format)  # type: ignore[arg-type]
+        channel = channel_for("unchanged" if format else "converted", format=format)  # type: ignore[arg-type]
         keys, secrets = keys_of(kind), [bright_model(100, seed).with_sh_degree(1) for seed in (1, 2)]
         model = embed_models(
             channel.prepare(bright_model(4000, 0)), keys, secrets[: len(keys)], entropy=bytes(32)
@@ -69,7 +69,7 @@ def test_keys(tab: Visit, published: Callable[[str], Path], tmp_path: Path, kind
 @pytest.mark.slow
 def test_file_in_colours(tab: Visit, tmp_path: Path) -> None:
     note = HiddenFile("a note.txt", b"Written at noon, read at night.\n")
-    prepared = channel_for("any", "colours").prepare(lifelike(6000, 0).with_sh_degree(0))
+    prepared = channel_for("converted", "colours").prepare(lifelike(6000, 0).with_sh_degree(0))
     write_model(tmp_path / "stego.spz", prepared.embed([(KEYS[0], note.payload())], entropy=bytes(32)))
     tab.goto(export_html(tmp_path / "stego.spz", tmp_path / "page.html")[0].as_uri())
     seen = []

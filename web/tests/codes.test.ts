@@ -1,6 +1,6 @@
 import { expect, test } from 'vitest';
-import { lastBits, levelsOf, log2 } from '../src/channels/quiet/fields.ts';
-import { QuietReader } from '../src/channels/quiet/reading.ts';
+import { lastBits, levelsOf, log2 } from '../src/channels/lsb/fields.ts';
+import { LsbReader } from '../src/channels/lsb/reading.ts';
 import { sortingOrder } from '../src/core/words.ts';
 import type { Codes } from '../src/files/models.ts';
 import { digest, jsonVector, modelOf } from './vectors.ts';
@@ -41,10 +41,10 @@ test.each(FILES)('wrong keys open nothing in %s with as many derivations', async
     salts.push(digest(salt));
     return new Uint8Array(32).fill(7);
   };
-  expect(await QuietReader.of(await modelOf(name))!.open('any', derive)).toBeNull();
+  expect(await LsbReader.of(await modelOf(name))!.open('any', derive)).toBeNull();
   expect(salts.length).toBe(1);
 });
 
 test('codes without capacity have no reader', async () => {
-  expect(QuietReader.of(await modelOf('published-2.spz'))).toBeNull();
+  expect(LsbReader.of(await modelOf('published-2.spz'))).toBeNull();
 });

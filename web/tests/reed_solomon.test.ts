@@ -18,8 +18,8 @@ for (let basis = 1; points.length < 256; ) {
   basis = root;
 }
 
-/** Chunks of two columns: values of polynomials with random coefficients. */
-function chunksOf(n: number, k: number, draw: () => number): Uint8Array[] {
+/** Shards of two columns: values of polynomials with random coefficients. */
+function shardsOf(n: number, k: number, draw: () => number): Uint8Array[] {
   const polynomials = [0, 1].map(() => Array.from({ length: k }, () => Math.floor(65536 * draw())));
   return Array.from({ length: n }, (_, row) => {
     const values = polynomials.map((each) => each.reduce((value, coefficient) => product(value, points[row]) ^ coefficient, 0));
@@ -28,18 +28,18 @@ function chunksOf(n: number, k: number, draw: () => number): Uint8Array[] {
 }
 
 test.each([[1, 9, 3, 2], [12, 40, 9, 10], [100, 180, 20, 40], [30, 30, 0, 0]])(
-  '%i of %i chunks, %i wrong and %i lost',
+  '%i of %i shards, %i wrong and %i lost',
   (k, n, wrong, lost) => {
     const draw = random(k);
-    const two = [chunksOf(n, k, draw), chunksOf(n, k, draw)];
-    const numbered = two.flatMap((chunks, codeword) =>
-      chunks.map((chunk, row): [number, Uint8Array] => [2 * row + codeword, chunk]).slice(codeword ? 0 : lost),
+    const two = [shardsOf(n, k, draw), shardsOf(n, k, draw)];
+    const numbered = two.flatMap((shards, codeword) =>
+      shards.map((shard, row): [number, Uint8Array] => [2 * row + codeword, shard]).slice(codeword ? 0 : lost),
     );
-    const seen = numbered.map(([number, chunk], at): [number, Uint8Array] => [
-      number, at < wrong ? chunk.map((each) => each ^ 77) : chunk,
+    const seen = numbered.map(([number, shard], at): [number, Uint8Array] => [
+      number, at < wrong ? shard.map((each) => each ^ 77) : shard,
     ]);
     const data = decoded({ count: 2, n, k, width: 4 }, seen.reverse(), wrong > 0);
-    const expected = Array.from({ length: k }, (_, row) => two.map((chunks) => [...chunks[row]])).flat(2);
+    const expected = Array.from({ length: k }, (_, row) => two.map((shards) => [...shards[row]])).flat(2);
     expect([...data]).toEqual(expected);
     if (lost) expect(() => decoded({ count: 2, n, k, width: 4 }, seen.slice(0, 2 * k - 1))).toThrow(/^The key is right/);
   },

@@ -78,7 +78,9 @@ def convert(
     data = model_bytes(path, with_extras(before, source, before))
     after = before if holds(path, data, before) else model_of_bytes(path, data)  # a copy takes memory
     secrets = tuple(
-        KeptSecret(each.remains.found, _size_left(after, key, target), "bytes" if each.file else "Gaussians")
+        KeptSecret(
+            each.recovered.found, _size_left(after, key, target), "bytes" if each.file else "Gaussians"
+        )
         for key, each in zip(keys, opened, strict=True)
     )
     size = None if source is None or is_standard(source) else source.stat().st_size
@@ -100,7 +102,7 @@ def convert(
 def _size_left(model: Gaussians, key: str, device: torch.device) -> int:
     """Gaussians or bytes of the secret that survived the conversion; 0 if none did."""
     try:
-        return reveal_any(model, key, device).remains.found
+        return reveal_any(model, key, device).recovered.found
     except (WrongKeyError, InputError, UsageError):
         return 0
 

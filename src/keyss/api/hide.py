@@ -17,7 +17,7 @@ import torch
 from keyss.api.fit import with_seed
 from keyss.api.hide_arguments import HideResult, Secret, method_for, sources_of
 from keyss.api.hide_checks import check_quality
-from keyss.channels import AnyChannel, Format, Publish
+from keyss.channels import ConvertedChannel, Format, Publish
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, ViewOptions
@@ -65,7 +65,7 @@ def hide(
     method: str | MethodOptions = DEFAULT,
     publish: Publish | None = None,
     format: Format | None = None,
-    channel: AnyChannel | None = None,
+    channel: ConvertedChannel | None = None,
     preset: str | None = None,
     width: int | None = None,
     background: Background = None,
@@ -85,12 +85,12 @@ def hide(
     Cover and secrets are scenes of photos, or models of any format, which are rendered for measurements.
     Plain models of scenes are fitted unless they are given. `method`: a name, with the length of training of
     `preset` ("quick", "default" or "full") on the device, or the options of a method (`CarryOptions`,
-    `KeyssOptions`). `publish`, `format` and `channel`, if given, replace those of the options. "as-is" hides
-    unnoticeably, in a file that must stay unchanged: in low bits of a "ply", or in the integers of an "spz",
-    "sog" or "compressed-ply", or of a model decoded from one. By default `format` is the cover's; if nothing
-    can be hidden in it unnoticed, `publish` becomes "any", with a warning. "any" survives conversion: in the
-    channel "appended" (more Gaussians, which are visible in the file) or "colours" (less capacity). `width`,
-    `background`, `skip_missing`: see `load_scene`.
+    `KeyssOptions`). `publish`, `format` and `channel`, if given, replace those of the options. "unchanged" is
+    for a file that must not change: secrets go unnoticed in low bits of a "ply", or in the integers of an
+    "spz", "sog" or "compressed-ply", or of a model decoded from one. By default `format` is the cover's; if
+    nothing can be hidden in it unnoticed, `publish` becomes "converted", with a warning. Such files may be
+    converted: secrets are in the channel "appended" (more Gaussians, which are visible in the file) or "colours" (less
+    capacity). `width`, `background`, `skip_missing`: see `load_scene`.
 
     `out` (a folder) gets `publish/` with the stego model, and `private/` with fitted models, `config.json`,
     `metrics.json`, `look.png` (test views of cover and secrets before and after), companion files for methods
@@ -103,7 +103,7 @@ def hide(
 
     At the end, the published file is opened with the keys and compared with the plain models. Raises
     QualityError, publishes nothing and keeps checkpoints if a PSNR is below `min_psnr` (dB; by default 20,
-    and 25 for secrets pruned without a refit) or no better than that of empty renders. Raises other
+    and 25 for secrets pruned without fine-tuning) or no better than that of empty renders. Raises other
     KeyssErrors too, and Interrupted on Ctrl-C.
     """
     target = resolve_device(device)

@@ -10,7 +10,7 @@ from keyss.measure.hide_quality import Shown
 from keyss.methods.method import MethodOptions
 
 MIN_PSNR = 20.0  # dB to the plain model; below it, renders show something else
-MIN_PRUNED_PSNR = 25.0  # dB, for secrets that lost Gaussians without a refit
+MIN_PRUNED_PSNR = 25.0  # dB, for secrets that lost Gaussians without fine-tuning
 _FAR = 30.0  # dB to the plain model; differences are visible below it
 _PSNR_TOLERANCE, _SSIM_TOLERANCE = 3.0, 0.1  # dB and SSIM to photos, below the plain model's
 # dB. Empty renders score high for dark or small objects, and highest for invisible ones.
@@ -40,8 +40,8 @@ def check_quality(
         limit = least if min_psnr is None else min_psnr
         kept = f" with {count:,} of {before:,} Gaussians" if cut else ""
         found = f"{who}{kept} is at {each.psnr:.1f} dB PSNR to its plain model"
-        way = '; `publish="any"` keeps all of them, and shows that there is a secret' * (
-            cut and options.publish != "any"
+        way = '; `publish="converted"` keeps all of them, and shows that there is a secret' * (
+            cut and options.publish != "converted"
         )
         if each.psnr < limit:
             raise QualityError(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from keyss.api.hide_arguments import check_keys
-from keyss.channels import AnyChannel, Channel, Format, Payload, Publish, channel_for, open_payload
+from keyss.channels import Channel, ConvertedChannel, Format, Payload, Publish, channel_for, open_payload
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
@@ -45,9 +45,9 @@ def hide_files(
     cover: PathLike | Gaussians,
     secrets: Sequence[SecretFile],
     *,
-    publish: Publish = "as-is",
+    publish: Publish = "unchanged",
     format: Format | None = None,
-    channel: AnyChannel = "colours",
+    channel: ConvertedChannel = "colours",
     out: PathLike | None = None,
     overwrite: bool = False,
     dry_run: bool = False,
@@ -56,7 +56,7 @@ def hide_files(
 
     `out` (a folder) gets `publish/` with the stego model. `publish`, `format`, `channel`: see `hide`;
     `dry_run`: write nothing, and return only the PSNR. Raises UsageError if the files do not fit (with
-    "as-is", into what goes unnoticed), and other KeyssErrors.
+    "unchanged", into what goes unnoticed), and other KeyssErrors.
     """
     if isinstance(cover, Scene) or not is_model(cover):
         raise UsageError("hiding a file needs a model as the cover; `keyss fit` makes one from photos")
@@ -76,7 +76,7 @@ def hide_files(
     except UsageError as error:
         if chosen.grows:
             raise
-        raise UsageError(f'{error}; `publish="any", channel="appended"` has room for all') from error
+        raise UsageError(f'{error}; `publish="converted", channel="appended"` has room for all') from error
     with folder.work() if folder else nullcontext():
         name = stego_name(stego)
         there = folder.write({name: with_extras(stego, cover, model)}) if folder else None
@@ -97,7 +97,7 @@ def _check_sizes(channel: Channel, cover: Gaussians, payloads: Sequence[Payload]
     if size > _MOST * typical:
         raise UsageError(
             f"the {channel.place} of a cover of {len(cover):,} Gaussians hold about {typical:,} bytes; the "
-            f'given take {size:,}; `publish="any", channel="appended"` has room for all'
+            f'given take {size:,}; `publish="converted", channel="appended"` has room for all'
         )
 
 

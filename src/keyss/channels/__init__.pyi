@@ -18,14 +18,7 @@ from .colours.colours_channel import (
     ColoursReader as ColoursReader,
 )
 from .colours.fountain import Fountain as Fountain
-from .names import AnyChannel as AnyChannel, Format as Format, Publish as Publish
-from .publishing import (
-    SUFFIXES as SUFFIXES,
-    channel_for as channel_for,
-    open_payload as open_payload,
-    suffix_of as suffix_of,
-)
-from .quiet.bits import (
+from .lsb.bits import (
     DEEPEST as DEEPEST,
     DEPTHS as DEPTHS,
     LEAST as LEAST,
@@ -35,26 +28,33 @@ from .quiet.bits import (
     used_words as used_words,
     write_low_bits as write_low_bits,
 )
-from .quiet.blocks import BlockReader as BlockReader
-from .quiet.cells import CellCipher as CellCipher
-from .quiet.fields import Field as Field, in_counted_order as in_counted_order, last_bits as last_bits
-from .quiet.payloads import QuietReader as QuietReader
-from .quiet.quiet_channel import (
+from .lsb.blocks import BlockReader as BlockReader
+from .lsb.cells import CellCipher as CellCipher
+from .lsb.fields import Field as Field, in_counted_order as in_counted_order, last_bits as last_bits
+from .lsb.lsb_channel import (
     LOW_BITS as LOW_BITS,
     CodesCover as CodesCover,
     InCodes as InCodes,
     LowBitsCover as LowBitsCover,
 )
-from .quiet.quiet_header import (
+from .lsb.lsb_header import (
     TYPICAL_SHARE as TYPICAL_SHARE,
     LowBitsCapacity as LowBitsCapacity,
     check_payload_fits as check_payload_fits,
 )
-from .quiet.spread import Chunks as Chunks, Message as Message
-from .quiet.usable import (
+from .lsb.payloads import LsbReader as LsbReader
+from .lsb.spread import Message as Message, Shards as Shards
+from .lsb.usable import (
     Carriers as Carriers,
     chance_of_bits as chance_of_bits,
     salt_rows as salt_rows,
     usable_carriers as usable_carriers,
+)
+from .names import ConvertedChannel as ConvertedChannel, Format as Format, Publish as Publish
+from .publishing import (
+    SUFFIXES as SUFFIXES,
+    channel_for as channel_for,
+    open_payload as open_payload,
+    suffix_of as suffix_of,
 )
 from .reed_solomon import Codewords as Codewords

@@ -43,7 +43,7 @@ class Payload:
 
     method: str  # 1 to METHOD_BYTES ASCII characters
     data: bytes
-    chunks: tuple[int, int] | None = field(default=None, compare=False)  # read and written; None: not divided
+    shards: tuple[int, int] | None = field(default=None, compare=False)  # read and written; None: not divided
     model_size: int | None = field(default=None, compare=False)  # Gaussians of the model it was read from
     foreign: int = field(default=0, compare=False)  # estimate of those added or changed after hiding
 

@@ -1,7 +1,7 @@
-"""Hashes, which hide nothing; pseudo-random numbers and sketches, which are derived from a secret.
+"""Hashes, which hide nothing; pseudo-random numbers and Bloom filters, which are derived from a secret.
 
-By a *sketch* of a model's Gaussians, a reader detects foreign ones: added or changed later. It is a Bloom
-filter (Bloom 1970) of B bits with one keyed hash. Each Gaussian hashes to one of `among` places, and those
+By a *Bloom filter* (Bloom 1970) of a model's Gaussians, a reader detects foreign ones: added or changed
+later. It has B bits and one keyed hash. Each Gaussian hashes to one of `among` places, and those
 below B are bits: a sample of the Gaussians, in which each is present with probability B / `among`. The bits
 of its own Gaussians are set, so losses do not matter. Of foreign ones in the sample, a share e^-1 hits unset
 bits if the filter holds B Gaussians. Equal IDs count once.
@@ -19,7 +19,7 @@ from cryptography.hazmat.primitives.ciphers.modes import ECB
 from keyss.core.arrays import Bytes, Doubles, Integers, Numbers, Words
 from keyss.keys.derivation import expand, stream
 
-SKETCH_BYTES = 32  # in low bits
+BLOOM_BYTES = 32  # in low bits
 _ODD = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: multiples have well-distributed high bits
 
 
@@ -64,8 +64,8 @@ def random_fractions(secret: bytes, label: str, count: int) -> Doubles:
     return (words.astype(np.float64) + 0.5) / 2.0**52
 
 
-def sketch(secret: bytes, ids: Bytes, size: int = SKETCH_BYTES, among: Integers | None = None) -> bytes:
-    """A sketch of `size` bytes of Gaussians with `ids` [N, 16].
+def bloom_filter(secret: bytes, ids: Bytes, size: int = BLOOM_BYTES, among: Integers | None = None) -> bytes:
+    """A Bloom filter of `size` bytes of Gaussians with `ids` [N, 16].
 
     `among` [N]: places that each hashes to, a function of its ID; by default N.
     """
@@ -75,10 +75,10 @@ def sketch(secret: bytes, ids: Bytes, size: int = SKETCH_BYTES, among: Integers 
 
 
 def foreign_share(secret: bytes, ids: Bytes, own: bytes, among: Integers | int, gone: float = 0.0) -> float:
-    """Estimated share, 0 to 1, of foreign Gaussians among those with `ids` [M, 16], by the sketch `own`.
+    """Estimated share, 0 to 1, of foreign Gaussians among those with `ids` [M, 16], by the filter `own`.
 
-    `among` [M]: as in `sketch`, if Gaussians count in inverse proportion to it; else the number of its
-    Gaussians. 1 if less than a share `gone` of the sketch's sample, rounded down, is there.
+    `among` [M]: as in `bloom_filter`, if Gaussians count in inverse proportion to it; else the number of its
+    Gaussians. 1 if less than a share `gone` of the Bloom filter's sample, rounded down, is there.
     """
     unset = np.unpackbits(np.frombuffer(own, np.uint8), bitorder="little") == 0
     places = _places(secret, ids, among, len(unset))
@@ -91,7 +91,7 @@ def foreign_share(secret: bytes, ids: Bytes, own: bytes, among: Integers | int, 
 
 def _places(secret: bytes, ids: Bytes, among: Integers | int, kept: int) -> Integers:
     """Places below `kept` [P] of different IDs."""
-    hashed = encrypted_blocks(expand(secret, "sketch", 32), ids)[:, :8].copy().view("<u4").astype(np.int64)
+    hashed = encrypted_blocks(expand(secret, "bloom", 32), ids)[:, :8].copy().view("<u4").astype(np.int64)
     places = hashed[:, 0] % np.maximum(1, among)
     sampled = np.flatnonzero(places < kept)
     _, first = np.unique(hashed[sampled, 0] << 32 | hashed[sampled, 1], return_index=True)

@@ -4,6 +4,6 @@ from __future__ import annotations
 
 from typing import Literal
 
-Publish = Literal["as-is", "any"]
-AnyChannel = Literal["appended", "colours"]  # for `publish="any"`
-Format = Literal["ply", "spz", "sog", "compressed-ply"]  # for `publish="as-is"`
+Publish = Literal["unchanged", "converted"]
+ConvertedChannel = Literal["appended", "colours"]  # for `publish="converted"`
+Format = Literal["ply", "spz", "sog", "compressed-ply"]  # for `publish="unchanged"`

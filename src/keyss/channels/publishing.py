@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import get_args
 
 from keyss.channels.base import Channel, Payload, Reader, copies, warned
-from keyss.channels.names import AnyChannel, Format, Publish
+from keyss.channels.names import ConvertedChannel, Format, Publish
 from keyss.core.errors import UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import CodedGaussians
@@ -18,29 +18,33 @@ SUFFIXES = {"spz": ".spz", "sog": ".sog", "compressed-ply": ".compressed.ply"}  
 
 def channel_for(
     publish: Publish,
-    channel: AnyChannel = "appended",
+    channel: ConvertedChannel = "appended",
     format: Format | None = None,
     cover: Gaussians | None = None,
 ) -> Channel:
-    """The channel for a model that is published "as-is", in `format`, or in "any" format.
+    """The channel for a model that is published "unchanged", in `format`, or "converted".
 
     As is, secrets go into the codes of a quantised `format`, or of the format from which `cover` was read or
     decoded; else into low bits. Imports that channel only. Raises UsageError for unknown names.
     """
-    choices = {"publish": (publish, Publish), "channel": (channel, AnyChannel), "format": (format, Format)}
+    choices = {
+        "publish": (publish, Publish),
+        "channel": (channel, ConvertedChannel),
+        "format": (format, Format),
+    }
     for name, (value, known) in choices.items():
         if value is not None and value not in get_args(known):
             raise UsageError(f"`{name}`: expected {' or '.join(get_args(known))}, got {value!r}")
-    if publish == "any" and channel == "appended":
+    if publish == "converted" and channel == "appended":
         from keyss.channels.appended.appended_channel import APPENDED
 
         return APPENDED
-    if publish == "any":
+    if publish == "converted":
         from keyss.channels.colours.colours_channel import COLOURS
 
         return COLOURS
-    from keyss.channels.quiet.decoded import Decoded
-    from keyss.channels.quiet.quiet_channel import LOW_BITS, InCodes
+    from keyss.channels.lsb.decoded import Decoded
+    from keyss.channels.lsb.lsb_channel import LOW_BITS, InCodes
 
     if format is None and isinstance(cover, CodedGaussians):
         return InCodes(cover.codes.name)
@@ -75,9 +79,9 @@ def open_payload(stego: Gaussians, key: str) -> Payload:
 
 def _readers(stego: Gaussians) -> Iterator[Reader | None]:
     """The readers of a model. Each channel is imported when the previous ones opened nothing."""
-    from keyss.channels.quiet.payloads import QuietReader
+    from keyss.channels.lsb.payloads import LsbReader
 
-    yield QuietReader.of(stego)
+    yield LsbReader.of(stego)
     from keyss.channels.appended.appended_channel import AppendedReader
 
     yield AppendedReader.of(stego)

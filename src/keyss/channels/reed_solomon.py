@@ -1,7 +1,7 @@
-"""Reed-Solomon over GF(2^16): any k of n chunks recover the data (Reed and Solomon 1960).
+"""Reed-Solomon over GF(2^16): any k of n shards recover the data (Reed and Solomon 1960).
 
-A chunk is a row of 16-bit symbols, big-endian. A column holds the values of a polynomial f of degree below k,
-chunk i that at the point `_POINTS`[i]. The first k chunks are the data. The field polynomial is
+A shard is a row of 16-bit symbols, big-endian. A column holds the values of a polynomial f of degree below k,
+shard i that at the point `_POINTS`[i]. The first k shards are the data. The field polynomial is
 x^16 + x^12 + x^3 + x + 1. Points are sums of a Cantor basis b: b_0 = 1, and b_j^2 + b_j = b_(j-1).
 
 All codewords are restored together, however their losses differ, in O(log n) operations per symbol, by the
@@ -9,7 +9,7 @@ additive FFT of Lin, Chung and Han (2014) and Forney's algorithm. Let L be the p
 lost points. The product f L is known everywhere: it is zero where f is not known. At a lost point, its
 derivative is f L'. An inverse FFT interpolates the product, and an FFT evaluates its derivative.
 
-Every chunk has its number, so lost chunks are erasures. Correcting a false chunk, an error, takes two chunks
+Every shard has its number, so lost shards are erasures. Correcting a false shard, an error, takes two shards
 more than k.
 """
 
@@ -27,7 +27,7 @@ from keyss.core.errors import InputError
 from keyss.kernels.jit import inline, kernel
 from keyss.kernels.parallel import in_blocks
 
-MAX_CHUNKS = 1 << 13  # per codeword; the field would allow more, at a cost in time
+MAX_SHARDS = 1 << 13  # per codeword; the field would allow more, at a cost in time
 SYMBOL_BYTES = 2
 LOST = "the key is right, but too much of the model was lost or changed since the secret was hidden in it"
 _POLYNOMIAL = 0x1100B
@@ -39,9 +39,9 @@ _MAX_ERRORS = 128  # maximum number of errors to locate per codeword
 
 @dataclass(frozen=True)
 class Codewords:
-    """Data in `count` codewords of `n` chunks of `width` bytes; any `k` chunks recover a codeword.
+    """Data in `count` codewords of `n` shards of `width` bytes; any `k` shards recover a codeword.
 
-    Chunk i of codeword c has the number i * count + c. Raises ValueError for impossible values.
+    Shard i of codeword c has the number i * count + c. Raises ValueError for impossible values.
     """
 
     count: int
@@ -50,11 +50,11 @@ class Codewords:
     width: int
 
     def __post_init__(self) -> None:
-        if not (self.count >= 1 and 1 <= self.k <= self.n <= MAX_CHUNKS and self.width % SYMBOL_BYTES == 0):
+        if not (self.count >= 1 and 1 <= self.k <= self.n <= MAX_SHARDS and self.width % SYMBOL_BYTES == 0):
             raise ValueError(f"impossible codewords: {self}")
 
     @property
-    def chunks(self) -> int:
+    def shards(self) -> int:
         return self.count * self.n
 
     @property
@@ -63,43 +63,43 @@ class Codewords:
         return self.count * self.k * self.width
 
     def encode(self, data: bytes) -> Bytes:
-        """Encode at most `size` bytes as chunks [chunks, width] in the order of their numbers."""
-        chunks = np.zeros((self.chunks, self.width), np.uint8)
-        chunks.reshape(-1)[: len(data)] = np.frombuffer(data, np.uint8)
-        rows = np.arange(self.chunks).reshape(self.n, self.count)
+        """Encode at most `size` bytes as shards [shards, width] in the order of their numbers."""
+        shards = np.zeros((self.shards, self.width), np.uint8)
+        shards.reshape(-1)[: len(data)] = np.frombuffer(data, np.uint8)
+        rows = np.arange(self.shards).reshape(self.n, self.count)
         rows[self.k :] = -1
-        _restore(chunks, rows, chunks.reshape(self.n, self.count, self.width))
-        return chunks
+        _restore(shards, rows, shards.reshape(self.n, self.count, self.width))
+        return shards
 
-    def decode(self, numbers: Integers, chunks: Bytes, *, errors: bool = False) -> bytes:
-        """Decode chunks [C, width] with `numbers` [C], in any order.
+    def decode(self, numbers: Integers, shards: Bytes, *, errors: bool = False) -> bytes:
+        """Decode shards [C, width] with `numbers` [C], in any order.
 
-        Ignores numbers with contradictory chunks. `errors`: other chunks may be false too. Raises InputError
+        Ignores numbers with contradictory shards. `errors`: other shards may be false too. Raises InputError
         if too few are left.
         """
-        inside = np.flatnonzero(numbers < self.chunks)
+        inside = np.flatnonzero(numbers < self.shards)
         own = numbers[inside]
         if len(own) >= self.count * self.k:  # otherwise save the memory
-            first = np.full(self.chunks, -1)
+            first = np.full(self.shards, -1)
             first[own[::-1]] = inside[::-1]
             again = inside[first[own] != inside]
-            differ = (chunks[again] != chunks[first[numbers[again]]]).any(axis=1)
+            differ = (shards[again] != shards[first[numbers[again]]]).any(axis=1)
             first[numbers[again[differ]]] = -1
             rows: Integers = first.reshape(self.n, self.count)
             if errors:
-                self._drop_errors(rows, chunks)
+                self._drop_errors(rows, shards)
             if ((rows >= 0).sum(axis=0) >= self.k).all():
-                data: Bytes = chunks[rows[: self.k]]
-                _restore(chunks, rows, data)
+                data: Bytes = shards[rows[: self.k]]
+                _restore(shards, rows, data)
                 return data.tobytes()
-        raise InputError(f"{LOST}: {len(np.unique(own)):,} of {self.chunks:,} chunks are left")
+        raise InputError(f"{LOST}: {len(np.unique(own)):,} of {self.shards:,} shards are left")
 
-    def _drop_errors(self, rows: Integers, chunks: Bytes) -> None:
-        """Set the `rows` [n, count] of false chunks to -1."""
+    def _drop_errors(self, rows: Integers, shards: Bytes) -> None:
+        """Set the `rows` [n, count] of false shards to -1."""
         for own in rows.T:
             numbers = np.flatnonzero(own >= 0)
             if len(numbers) > self.k:
-                own[numbers[~_consistent_rows(numbers, chunks[own[numbers]], self.k, self.n)]] = -1
+                own[numbers[~_consistent_rows(numbers, shards[own[numbers]], self.k, self.n)]] = -1
 
 
 def _tables() -> tuple[Shorts, Integers]:
@@ -119,11 +119,11 @@ _POWERS, _LOGARITHMS = _tables()
 
 
 def _points() -> Integers:
-    """[2 MAX_CHUNKS] field elements: sums of a Cantor basis, at index i of those whose bits are set in i."""
+    """[2 MAX_SHARDS] field elements: sums of a Cantor basis, at index i of those whose bits are set in i."""
     every = np.arange(1 << 16)
     squares = _POWERS[_LOGARITHMS * 2 % _ORDER] * (every > 0)
     points, basis = np.zeros(1, np.int64), 1
-    while len(points) < 2 * MAX_CHUNKS:
+    while len(points) < 2 * MAX_SHARDS:
         points = np.concatenate([points, points ^ basis])
         basis = int(np.flatnonzero((squares ^ every) == basis)[0])  # the smaller of two roots
     return points
@@ -132,17 +132,17 @@ def _points() -> Integers:
 _POINTS = _points()
 
 
-def _restore(chunks: Bytes, rows: Integers, data: Bytes) -> None:
-    """Fill the rows of `data` [R, count, width] whose chunk is lost.
+def _restore(shards: Bytes, rows: Integers, data: Bytes) -> None:
+    """Fill the rows of `data` [R, count, width] whose shard is lost.
 
-    `rows` [n, count]: the row of `chunks` of each chunk; -1 for lost ones.
+    `rows` [n, count]: the row of `shards` of each shard; -1 for lost ones.
     """
-    columns = chunks.shape[1] // SYMBOL_BYTES
+    columns = shards.shape[1] // SYMBOL_BYTES
     wanted = np.flatnonzero((rows[: len(data)] < 0).any(axis=0))
     own, logarithms, twiddles, walsh = rows[:, wanted], _LOGARITHMS, *_constants(_size(len(rows)))
 
     def restore(start: int, stop: int) -> None:
-        _restore_columns(start, stop, chunks, own, wanted, data, _POWERS, logarithms, twiddles, walsh)
+        _restore_columns(start, stop, shards, own, wanted, data, _POWERS, logarithms, twiddles, walsh)
 
     in_blocks(restore, len(wanted) * columns, _COLUMNS, _restore_columns)
 
@@ -190,7 +190,7 @@ def _multiply_differences(points: Any, walsh: Any) -> None:
 def _restore_columns(
     start: Any,
     stop: Any,
-    chunks: Any,
+    shards: Any,
     rows: Any,
     wanted: Any,
     data: Any,
@@ -203,7 +203,7 @@ def _restore_columns(
 
     `rows` [n, C], `wanted` [C]: of codewords with losses.
     """
-    size, columns = len(walsh), chunks.shape[1] // 2
+    size, columns = len(walsh), shards.shape[1] // 2
     first, last = start // columns, (stop - 1) // columns
     products = np.ones((last - first + 1, size), np.int64)  # L' at lost points, else L, as logarithms
     work = np.zeros((size, stop - start), np.uint16)
@@ -217,7 +217,7 @@ def _restore_columns(
             row = rows[point, codeword]
             if row >= 0:
                 for at in range(max(0, offset), min(stop - start, offset + columns)):
-                    symbol = chunks[row, 2 * (at - offset)] << 8 | chunks[row, 2 * (at - offset) + 1]
+                    symbol = shards[row, 2 * (at - offset)] << 8 | shards[row, 2 * (at - offset) + 1]
                     work[point, at] = powers[own[point] + logarithms[symbol]]
     _to_coefficients(work, twiddles)
     _differentiate(work)
@@ -227,10 +227,10 @@ def _restore_columns(
         offset = codeword * columns - start
         for point in range(min(len(rows), len(data))):
             if rows[point, codeword] < 0:
-                chunk = data[point, wanted[codeword]]
+                shard = data[point, wanted[codeword]]
                 for at in range(max(0, offset), min(stop - start, offset + columns)):
                     symbol = powers[65535 - own[point] + logarithms[work[point, at]]]
-                    chunk[2 * (at - offset)], chunk[2 * (at - offset) + 1] = symbol >> 8, symbol & 255
+                    shard[2 * (at - offset)], shard[2 * (at - offset) + 1] = symbol >> 8, symbol & 255
 
 
 @inline
@@ -299,7 +299,7 @@ def _consistent_rows(numbers: Integers, rows: Bytes, k: int, n: int) -> Flags:
     points b. Otherwise their shortest linear recurrence locates the errors (Massey 1969); if there are too
     many, it finds none.
     """
-    points = _POINTS[MAX_CHUNKS + numbers]
+    points = _POINTS[MAX_SHARDS + numbers]
     _, walsh = _constants(_size(n))
     products = np.zeros(len(walsh), np.int64)
     products[numbers] = 1

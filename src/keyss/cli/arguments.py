@@ -38,7 +38,7 @@ Preset = Annotated[
 ]
 Width = Annotated[int | None, optional("PIXELS", "Downscale wider photos to this width.")]
 Iterations = Annotated[
-    int | None, optional("N", "Training steps of a model, and of a refit.", "the preset's")
+    int | None, optional("N", "Training steps of a model, and of fine-tuning.", "the preset's")
 ]
 MaxGaussians = Annotated[int | None, optional("N", "Maximum number of Gaussians of a model.", "the preset's")]
 Overwrite = Annotated[bool, switch("Replace existing results.")]

@@ -207,7 +207,7 @@ def _one_line(message: str) -> str:
 
 
 def as_flags(message: str, options: Collection[str]) -> str:
-    """Replace arguments between backticks in `message` by flags, such as `publish="any", overwrite=True`.
+    """Replace arguments between backticks in `message` by flags, such as `width=200, overwrite=True`.
 
     Names without a value are replaced only if they are in `options`.
     """

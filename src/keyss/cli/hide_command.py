@@ -40,7 +40,7 @@ _HOW_TO_PUBLISH = {False: "publish this file unchanged", True: "publish this fil
 
 @dataclass(frozen=True, kw_only=True)
 class Details:
-    """Plain models, the check of the result, and the channel of --publish any."""
+    """Plain models, the check of the result, and the channel of --publish converted."""
 
     cover_model: Annotated[
         Path | None, optional("FILE", "Plain 3DGS model of a cover of photos.", "fitted")
@@ -54,7 +54,7 @@ class Details:
         optional(
             "DB",
             "Fail if the PSNR of cover or secret to its plain model is below this.",
-            "20, and 25 for secrets that were pruned without a refit",
+            "20, and 25 for secrets that were pruned without fine-tuning",
         ),
     ] = None
     bound: Annotated[
@@ -65,8 +65,8 @@ class Details:
         Literal["appended", "colours"] | None,
         optional(
             "{appended,colours}",
-            "With --publish any: appended Gaussians hold everything, but are visible in the file; colours "
-            "hold less and show less.",
+            "With --publish converted: appended Gaussians hold everything, but are visible in the file; "
+            "colours hold less and show less.",
             "appended for scenes, colours for files",
         ),
     ] = None
@@ -93,18 +93,18 @@ class HideArguments:
     ] = ()
     key_file: KeyFiles = ()
     publish: Annotated[
-        Literal["as-is", "any"],
+        Literal["unchanged", "converted"],
         arg(
-            help="as-is: a file that must stay unchanged, in which the secret goes unnoticed; becomes any, "
-            "with a warning, if a scene has too little room. any: a .ply that may be converted later; "
-            "whoever inspects it sees that it holds something."
+            help="unchanged: a file that must stay unchanged, in which the secret goes unnoticed; becomes "
+            "converted, with a warning, if a scene has too little room. converted: a .ply that may be "
+            "converted later; whoever inspects it sees that it holds something."
         ),
-    ] = "as-is"
+    ] = "unchanged"
     format: Annotated[
         Literal["ply", "spz", "sog", "compressed-ply"] | None,
         optional(
             "{ply,spz,sog,compressed-ply}",
-            "With --publish as-is: this file and nothing else; all but ply hold small secrets only.",
+            "With --publish unchanged: this file and nothing else; all but ply hold small secrets only.",
             "the cover's",
         ),
     ] = None
@@ -157,7 +157,7 @@ def _hide_scenes(args: HideArguments, options: MethodOptions) -> None:
     if idle and not options.may_train:
         raise UsageError(
             f"{idle}: nothing is trained, as models of all scenes are given and --method {options.method} "
-            "does not refit them: leave out such options"
+            "does not fine-tune them: leave out such options"
         )
     result = keyss.hide(
         args.cover,

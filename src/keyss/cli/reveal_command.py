@@ -73,9 +73,9 @@ def reveal(
     if revealed.file is not None:
         print_written(out, f"{revealed.file.name!r}, {len(revealed.file.data):,} bytes")
         return
-    remains = revealed.remains
-    of = f" of {remains.hidden:,}" if remains.hidden else ""
-    print_written(out, f"{remains.found:,}{of} Gaussians")
+    recovered = revealed.recovered
+    of = f" of {recovered.hidden:,}" if recovered.hidden else ""
+    print_written(out, f"{recovered.found:,}{of} Gaussians")
 
 
 def verify(

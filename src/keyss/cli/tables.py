@@ -214,11 +214,8 @@ def print_conversion(out: Path, found: Conversion, *, dry_run: bool) -> None:
         state = "survives" if secret.kept else f"is lost: {secret.after:,} {secret.unit} are left"
         print(f"{which}, {secret.before:,} {secret.unit}, {state}", file=file)
     if not found.secrets and not found.keeps_low_bits:
-        state = "would be" if dry_run else "is"
-        print(
-            f"what was hidden with --publish as-is, if anything, {state} lost; --key-file checks a secret",
-            file=file,
-        )
+        state = "would be" if dry_run else "are"
+        print(f"secrets of --publish unchanged, if any, {state} lost; --key-file checks one", file=file)
     if dry_run:
         print("dry run: nothing was written", file=file)
 

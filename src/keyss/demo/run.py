@@ -104,7 +104,7 @@ def _hide_for_web(out: Path, cover: Scene, secret: Scene, key: str, device: Back
     hidden = keyss.hide(
         cover,
         [keyss.Secret(secret, key, plain_secret)],
-        method=CarryOptions(publish="any"),
+        method=CarryOptions(publish="converted"),
         cover_model=plain_cover,
         min_psnr=0,
         device=device,

@@ -27,7 +27,7 @@ from keyss.fitting.schedule import Schedule, shrinking
 from keyss.progress import Reporter
 from keyss.rendering import render_with_meta
 
-REFIT_SETTLE = 0.5  # `settle` of a refit
+FINE_TUNING_SETTLE = 0.5  # `settle` of fine-tuning
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def fit_scene(
     config, inputs = (config or FitConfig()).with_seed(), {"scene": scene.digest()}
     if model is not None:
         rates = {name: rate * value for name, value in vars(config).items() if name.endswith("_rate")}
-        config = replace(config, sh_degree=model.sh_degree, settle=REFIT_SETTLE, boost=1.0, **rates)
+        config = replace(config, sh_degree=model.sh_degree, settle=FINE_TUNING_SETTLE, boost=1.0, **rates)
         inputs["model"] = model.digest()
     run = PlainRun(scene, config, torch.device(device), model)
     fingerprint = {**inputs, "config": asdict(config)}

@@ -69,7 +69,7 @@ def _argon2id(key: bytes, salt: bytes) -> bytes:
 class DerivedKey:
     """A key after Argon2id with one salt, and the values that follow from it.
 
-    Labels in use: "embedding" (conditions the decoder), "verifier" (compares keys), "quiet/key" (encrypts a
+    Labels in use: "embedding" (conditions the decoder), "verifier" (compares keys), "lsb/key" (encrypts a
     data key), "writer" (randomness of hiding), and those of the other channels.
     """
 

@@ -7,7 +7,12 @@ from .codec.precision import (
     most_visible as most_visible,
     prune_to_size as prune_to_size,
 )
-from .hidden import Frame as Frame, HiddenFile as HiddenFile, HiddenScene as HiddenScene, Remains as Remains
+from .hidden import (
+    Frame as Frame,
+    HiddenFile as HiddenFile,
+    HiddenScene as HiddenScene,
+    Recovered as Recovered,
+)
 from .keyss.decoder import Decoder as Decoder
 from .keyss.keyss_method import (
     KeyssSecret as KeyssSecret,

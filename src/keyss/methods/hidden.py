@@ -21,12 +21,12 @@ MAX_NAME_BYTES = 255
 
 
 @dataclass(frozen=True)
-class Remains:
+class Recovered:
     """The part of a secret that is left in a model."""
 
     found: int  # Gaussians that are left
     hidden: int  # Gaussians that were hidden; 0: unknown
-    chunks: tuple[int, int] | None = None  # payload chunks left and written; None: not divided
+    shards: tuple[int, int] | None = None  # payload shards left and written; None: not divided
     slack: float = 0.0  # relative difference of `found` and `hidden` that is not a loss
 
     @property
@@ -37,7 +37,7 @@ class Remains:
     @property
     def whole(self) -> bool:
         """True if nothing was lost or added."""
-        return abs(self.share - 1) <= self.slack and (self.chunks is None or self.chunks[0] == self.chunks[1])
+        return abs(self.share - 1) <= self.slack and (self.shards is None or self.shards[0] == self.shards[1])
 
 
 class HiddenScene(ABC):
@@ -63,9 +63,9 @@ class HiddenScene(ABC):
         position.
         """
 
-    def remains(self, revealed: Gaussians) -> Remains:
+    def recovered(self, revealed: Gaussians) -> Recovered:
         """The part of the secret that the result of `reveal` contains; by default all of it."""
-        return Remains(len(revealed), len(revealed))
+        return Recovered(len(revealed), len(revealed))
 
     @abstractmethod
     def fingerprint(self) -> str:
@@ -78,7 +78,7 @@ class HiddenFile:
 
     name: str
     data: bytes = field(repr=False)
-    chunks: tuple[int, int] | None = field(default=None, compare=False)  # see `Payload`
+    shards: tuple[int, int] | None = field(default=None, compare=False)  # see `Payload`
 
     def payload(self) -> Payload:
         """The payload for a channel. Raises UsageError for a name longer than MAX_NAME_BYTES."""
@@ -96,7 +96,7 @@ class HiddenFile:
         name, data = payload.data[1 : 1 + size], payload.data[1 + size :]
         if not payload.data or len(name) < size:
             raise InputError("the hidden file is damaged: its name is cut off")
-        return HiddenFile(name.decode(errors="replace"), data, payload.chunks)
+        return HiddenFile(name.decode(errors="replace"), data, payload.shards)
 
 
 class OpensAFileError(InputError):

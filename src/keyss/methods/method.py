@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
-from keyss.channels.names import AnyChannel, Format, Publish
+from keyss.channels.names import ConvertedChannel, Format, Publish
 from keyss.core.errors import UsageError
 from keyss.fitting.config import FitConfig, preset_for
 
@@ -125,19 +125,19 @@ class MethodOptions:
     method: ClassVar[str]  # name in files and on the command line, 1 to 15 ASCII characters
 
     fit: FitConfig = field(default_factory=FitConfig)  # plain models, and joint training
-    publish: Publish = "as-is"  # or any: the published model may be converted
-    format: Format | None = None  # for `publish="as-is"`; None: the cover's format
-    # For `publish="any"`: appended Gaussians have unlimited capacity but are visible in the file; colours are
-    # less visible but have little capacity.
-    channel: AnyChannel = "appended"
+    publish: Publish = "unchanged"  # or "converted": the published model may be
+    format: Format | None = None  # for `publish="unchanged"`; None: the cover's format
+    # For `publish="converted"`: appended Gaussians have unlimited capacity but are visible in the file;
+    # colours are less visible but have little capacity.
+    channel: ConvertedChannel = "appended"
 
     def __post_init__(self) -> None:
         """Raise UsageError for options that contradict each other."""
-        if self.channel != "appended" and self.publish != "any":
+        if self.channel != "appended" and self.publish != "converted":
             raise UsageError(
-                f'`channel="{self.channel}"` is for models that may be converted (`publish="any"`)'
+                f'`channel="{self.channel}"` is for models that may be converted (`publish="converted"`)'
             )
-        if self.format and self.publish == "any":
+        if self.format and self.publish == "converted":
             raise UsageError(f'`format="{self.format}"` is for models that stay as they are: leave it out')
 
     @classmethod

@@ -177,8 +177,8 @@ def _capacities(model: Gaussians) -> Iterator[str]:
     from keyss.channels import channel_for
 
     ways: list[tuple[str, Any]] = [
-        *((f"--format {each}", ("as-is", "appended", each)) for each in get_args(Format)),
-        ("--publish any --channel colours", ("any", "colours", None)),
+        *((f"--format {each}", ("unchanged", "appended", each)) for each in get_args(Format)),
+        ("--publish converted --channel colours", ("converted", "colours", None)),
     ]
     for flags, (publish, channel, format) in ways:
         try:
@@ -188,7 +188,7 @@ def _capacities(model: Gaussians) -> Iterator[str]:
             continue
         size = max(0, found.bytes - found.overhead)
         yield f"{flags}: {size:,} bytes, a model of about {size // _BYTES_PER_GAUSSIAN:,} Gaussians"
-    yield "--publish any: any secret, as the file grows"
+    yield "--publish converted: any secret, as the file grows"
 
 
 def _round(values: Iterable[Any]) -> tuple[float, ...]:

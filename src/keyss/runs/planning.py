@@ -27,7 +27,7 @@ _RENDERS = 2  # training steps that take as long as measuring a test view
 _CHECKPOINTS = 6  # two checkpoints / model: each holds parameters and two moments of Adam
 _MAX_APPENDED = 7  # Gaussians that hold one Gaussian of a secret of SH degree 3
 _COPIES = 2  # of what is published and of the secrets in memory, beside the given models
-_CHUNKS = 7  # copies of appended Gaussians: their chunks, coded, placed and read again
+_SHARDS = 7  # copies of appended Gaussians: their shards, coded, placed and read again
 _OTHER_BYTES = 4 << 20  # JSON files, locks, and the overhead of the file system
 
 
@@ -95,7 +95,7 @@ def cost_of(
     gaussian = 4 * (14 + 3 * (degree + 1) ** 2)  # bytes in a .ply, with normals
     resident: int = psutil.Process().memory_info().rss
     largest = max(published, *sizes) * gaussian
-    memory = resident + (_COPIES * (published + sum(sizes[1:])) + _CHUNKS * appended) * gaussian
+    memory = resident + (_COPIES * (published + sum(sizes[1:])) + _SHARDS * appended) * gaussian
     if trained:  # gradients, moments and two checkpoints
         memory += (1 + _CHECKPOINTS) * largest
         memory += max(Targets.max_bytes(source.scene.train) for source in sources)

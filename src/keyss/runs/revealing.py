@@ -13,7 +13,7 @@ from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.files.inputs import read_file
 from keyss.methods import companion as companions, registry
-from keyss.methods.hidden import Frame, HiddenFile, HiddenScene, OpensAFileError, Remains
+from keyss.methods.hidden import Frame, HiddenFile, HiddenScene, OpensAFileError, Recovered
 from keyss.runs.files import PathLike
 
 MIN_LEFT = 0.1  # share; pruning compensation stops there, and renders become empty
@@ -30,7 +30,7 @@ class Revealed:
     """The scene or the file that a key opened."""
 
     scene: Gaussians | None  # on the CPU
-    remains: Remains  # bytes instead of Gaussians for a file
+    recovered: Recovered  # bytes instead of Gaussians for a file
     warnings: tuple[str, ...] = ()  # missing Gaussians
     file: HiddenFile | None = None
 
@@ -43,9 +43,9 @@ class Revealed:
 
     def check_usable(self) -> None:
         """Raise InputError if so little is left that renders would be nearly empty."""
-        if self.remains.share < MIN_LEFT:
+        if self.recovered.share < MIN_LEFT:
             raise InputError(
-                f"{_count(self.remains)}, too few to render (expected at least {MIN_LEFT:.0%}): the others "
+                f"{_count(self.recovered)}, too few to render (expected at least {MIN_LEFT:.0%}): the others "
                 f"{_CAUSE}; use the file as it was published, or `force=True` to get the rest"
             )
 
@@ -75,8 +75,8 @@ def reveal_model(
     else:
         opened = registry.open_model(model, key)
     revealed = opened.reveal(model.to(device), frame=frame, force=force)
-    remains = opened.remains(revealed)
-    return Revealed(revealed, remains, tuple(loss_warnings(remains)))
+    recovered = opened.recovered(revealed)
+    return Revealed(revealed, recovered, tuple(loss_warnings(recovered)))
 
 
 def reveal_any(model: Gaussians, key: str, device: torch.device) -> Revealed:
@@ -89,32 +89,32 @@ def reveal_any(model: Gaussians, key: str, device: torch.device) -> Revealed:
 
 def revealed_file(file: HiddenFile) -> Revealed:
     """The result for a hidden file, which is always complete."""
-    remains = Remains(len(file.data), len(file.data), file.chunks)
-    return Revealed(None, remains, tuple(loss_warnings(remains)) if file.data else (), file)
+    recovered = Recovered(len(file.data), len(file.data), file.shards)
+    return Revealed(None, recovered, tuple(loss_warnings(recovered)) if file.data else (), file)
 
 
-def loss_warnings(remains: Remains) -> list[str]:
+def loss_warnings(recovered: Recovered) -> list[str]:
     """Warnings about an incomplete secret."""
-    if remains.share < 1 - NOTICED_LOSS:
+    if recovered.share < 1 - NOTICED_LOSS:
         return [
-            f"{_count(remains)}: the others {_CAUSE}; the rest was made larger and denser to compensate; the "
-            "file as it was published gives the whole secret"
+            f"{_count(recovered)}: the others {_CAUSE}; the rest was made larger and denser to compensate; "
+            "the file as it was published gives the whole secret"
         ]
-    if remains.share > 1 + NOTICED_LOSS:
-        return [f"{_count(remains)}: Gaussians were copied or changed in the published file"]
-    left, chunks = remains.chunks or (0, 0)
-    if left < chunks:
+    if recovered.share > 1 + NOTICED_LOSS:
+        return [f"{_count(recovered)}: Gaussians were copied or changed in the published file"]
+    left, shards = recovered.shards or (0, 0)
+    if left < shards:
         return [
-            f"{chunks - left:,} of {chunks:,} chunks of the secret's payload were lost, and restored: the "
+            f"{shards - left:,} of {shards:,} shards of the secret's payload were lost, and restored: the "
             "published file was changed"
         ]
     return []
 
 
-def _count(remains: Remains) -> str:
-    if not remains.hidden:
-        return f"{remains.found:,} Gaussians of the secret were found"
-    return f"{remains.found:,} of {remains.hidden:,} Gaussians of the secret were found"
+def _count(recovered: Recovered) -> str:
+    if not recovered.hidden:
+        return f"{recovered.found:,} Gaussians of the secret were found"
+    return f"{recovered.found:,} of {recovered.hidden:,} Gaussians of the secret were found"
 
 
 def read_companion(path: PathLike) -> HiddenScene:
@@ -149,8 +149,8 @@ class SecretCheck:
     hidden: int  # in all; 0: unknown
     unit: str  # of both: Gaussians, or bytes of a hidden file
     share: float  # found / hidden
-    chunks: int | None  # chunks of the payload; None if it is not divided
-    chunks_lost: int | None  # restored by error correction
+    shards: int | None  # shards of the payload; None if it is not divided
+    shards_lost: int | None  # restored by error correction
     problems: tuple[str, ...]
 
 
@@ -210,16 +210,16 @@ def check_model(model: Gaussians) -> ModelCheck:
 
 def check_secret(revealed: Revealed, warned: Sequence[str] = ()) -> SecretCheck:
     """Count what is missing of a revealed secret; `warned`: what opening it warned of."""
-    remains = revealed.remains
+    recovered = revealed.recovered
     problems = [*warned, *revealed.warnings]
-    if revealed.file is None and not remains.whole and not problems:
-        problems.append(_count(remains))
+    if revealed.file is None and not recovered.whole and not problems:
+        problems.append(_count(recovered))
     return SecretCheck(
-        found=remains.found,
-        hidden=remains.hidden,
+        found=recovered.found,
+        hidden=recovered.hidden,
         unit="Gaussians" if revealed.file is None else "bytes",
-        share=round(remains.share, 4),
-        chunks=remains.chunks and remains.chunks[1],
-        chunks_lost=remains.chunks and remains.chunks[1] - remains.chunks[0],
+        share=round(recovered.share, 4),
+        shards=recovered.shards and recovered.shards[1],
+        shards_lost=recovered.shards and recovered.shards[1] - recovered.shards[0],
         problems=tuple(problems),
     )

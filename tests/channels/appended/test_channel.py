@@ -241,7 +241,7 @@ def test_copies_of_one_faint_gaussian_do_not_hide_the_frame(seed: int, stego: Ga
 
 
 def test_too_great_a_loss_is_told_from_a_wrong_key(stego: Gaussians) -> None:
-    with pytest.raises(InputError, match=r"the key is right, but too much .* chunks are left"):
+    with pytest.raises(InputError, match=r"the key is right, but too much .* shards are left"):
         opened(cropping(1)(stego))
     with pytest.raises(WrongKeyError):
         opened(stego[stego.opacities > 2 * DRAWN_OPACITY])
@@ -331,7 +331,7 @@ def test_a_secret_put_into_another_file_is_told(
     ],
     ids=["far larger, far away", "a point beside numbers beyond float32"],
 )
-def test_a_file_out_of_range_of_the_sketch_is_told(host: Similarity, own: Similarity) -> None:
+def test_out_of_range_file_warns(host: Similarity, own: Similarity) -> None:
     """From the cover of the secret it looks like few Gaussians, or like none."""
     large = embedded(lifelike(60_000, 6), [(KEY, Payload("file", DATA))], entropy=ENTROPY)
     visible = lifelike(60_000, 5)
@@ -361,7 +361,7 @@ def test_stacks_of_faint_gaussians_are_told(stego: Gaussians) -> None:
 
 
 def test_a_small_file_with_the_secret_of_a_far_larger_one_is_told(stego: Gaussians) -> None:
-    """Hardly any of its Gaussians are in the sample of the larger one's sketch."""
+    """Hardly any of its Gaussians are in the sample of the larger one's Bloom filter."""
     large = embedded(lifelike(60_000, 6), [(KEY, Payload("file", DATA))], entropy=ENTROPY)
     small = Gaussians.cat([lifelike(300, 5), large[60_000:]])
     with pytest.warns(KeyssWarning, match="Gaussians were added"):

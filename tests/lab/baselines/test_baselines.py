@@ -115,7 +115,7 @@ def test_invalid_arguments(folders: tuple[Path, Path]) -> None:
     with pytest.raises(UsageError, match="1 to 1 secrets"):
         keyss.hide(folders[0], [Secret(folders[1]), Secret(folders[0])], method="3dgs-sh")
     with pytest.raises(UsageError, match="publish"):
-        options_of("gs-hider", publish="any")
+        options_of("gs-hider", publish="converted")
     with pytest.raises(UsageError, match="key is empty"):
         keyss.hide(folders[0], [Secret(folders[1])], method="carry")
 

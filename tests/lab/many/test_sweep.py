@@ -90,7 +90,7 @@ def write_spec(folder: Path, covers: list[str], seeds: int, more: str = "") -> P
         if not (folder / name).exists():
             (folder / name).write_text(name)
     pairs = "\n".join(f"  - {{cover: {name}, secrets: [secret.ply]}}" for name in covers)
-    text = f"pairs:\n{pairs}\nmethods:\n  - {{method: carry, options: {{publish: any}}}}\n"
+    text = f"pairs:\n{pairs}\nmethods:\n  - {{method: carry, options: {{publish: converted}}}}\n"
     return spec_of(folder, f"{text}seeds: {list(range(seeds))}\n{more}")
 
 
@@ -139,7 +139,7 @@ def test_changed_files_and_options(tmp_path: Path) -> None:
     assert skipped(run(spec, out)) == [False, False]
     os.utime(tmp_path / "a.ply", (5, 5))
     assert skipped(run(spec, out)) == [False, False]
-    spec.write_text(spec.read_text().replace("publish: any", "publish: any, refit: never"))
+    spec.write_text(spec.read_text().replace("publish: converted", "publish: converted, fine_tune: never"))
     assert skipped(run(spec, out)) == [False, False]
     assert skipped(run(spec, out)) == [True, True]
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from channels.quiet.trained_like import rounded, trained_like
+from channels.lsb.trained_like import rounded, trained_like
 from keyss.core import Gaussians
 
 COUNT = 3000

@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from channels.quiet.trained_like import keys
+from channels.lsb.trained_like import keys
 from keyss.core import UsageError
 from keyss.lab import changed_low_bits, judge
 from lab.stealth.candidates import candidate_scores, confirmation_p

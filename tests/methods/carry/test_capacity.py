@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from keyss import CarryOptions, Gaussians
 from keyss.channels import Layout, LowBitsCapacity
 from keyss.core import KeyssWarning, UsageError
@@ -34,7 +34,7 @@ def _unit(model: Gaussians) -> Gaussians:
 def test_cover_without_harmonics(change: Callable[[Gaussians], Gaussians], least: int) -> None:
     """A secret is pruned to what the low bits of geometry hold."""
     cover, secret = change(trained_like(20_000, sh_degree=0)), trained_like(4000, 1, 2)
-    options = _prepare(CarryOptions(refit="never", format="ply"), cover, secret)
+    options = _prepare(CarryOptions(fine_tune="never", format="ply"), cover, secret)
     sources = [Source(each, False, KEY, scene_of_model(each, "m", size=24)) for each in (cover, secret)]
     planned = registry.get("carry").plan(sources, options)
     context = Context(torch.device("cpu"), entropy=bytes(32))
@@ -57,9 +57,9 @@ def test_predictable_cover_is_refused() -> None:
     with pytest.raises(UsageError, match=r"random low bits.*`publish=.any.`"):
         _prepare(CarryOptions(format="ply"), grey, grey)
     with pytest.warns(KeyssWarning, match=r"whoever inspects.*random low bits"):
-        assert _prepare(CarryOptions(), grey, grey).publish == "any"
+        assert _prepare(CarryOptions(), grey, grey).publish == "converted"
     _prepare(CarryOptions(), trained_like(8000), grey)
-    _prepare(CarryOptions(publish="any"), grey, grey)
+    _prepare(CarryOptions(publish="converted"), grey, grey)
 
 
 @pytest.mark.parametrize("gaussians", [600, 1600, 5300, 27_000])

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import keyss
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from cli.harness import Run, write_key
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.core import UsageError
@@ -75,7 +75,7 @@ def test_hide_and_reveal_files(run: Run, tmp_path: Path) -> None:
         (("--design", "released"), "keyss"),
         (("--mask", "op", "--method=carry"), "keyss"),
         (("--key_encoder=clip", "--method", "keyss", "--method", "carry"), "keyss"),
-        (("--refit", "never", "--method", "keyss"), "carry"),
+        (("--fine-tune", "never", "--method", "keyss"), "carry"),
     ],
 )
 def test_options_of_other_methods(run: Run, tmp_path: Path, arguments: tuple[str, ...], having: str) -> None:
@@ -120,7 +120,7 @@ def test_hide_in_cover_of_few_steps(steps: int, views: int) -> None:
 
 
 def test_min_psnr_of_pruned_secret(run: Run, tmp_path: Path) -> None:
-    hide = (*HIDE, "--cover", "cover.ply", "--secret", "large.ply", "--format", "spz", "--refit=never")
+    hide = (*HIDE, "--cover", "cover.ply", "--secret", "large.ply", "--format", "spz", "--fine-tune=never")
     status, out, err = run(*hide, "-o", tmp_path / "out")
     assert status == 7
     assert re.search(r"the secret with [\d,]+ of 6,000 Gaussians is at .* below 25 dB: nothing was", err)

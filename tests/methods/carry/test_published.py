@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import keyss
-from channels.quiet.coded import model_of
+from channels.lsb.coded import model_of
 from files.formats.examples import same_codes
 from keyss import CarryOptions
 from keyss.channels import SUFFIXES, channel_for, in_counted_order
@@ -41,7 +41,7 @@ def test_hide_reveal_verify_and_info(format: str, tmp_path: Path) -> None:
 @every_format
 def test_large_secrets_are_pruned(format: str) -> None:
     cover, asked = model_of(2500), [keyss.Secret(model_of(1500, 1), "key one")]
-    pruning = CarryOptions(format=format, refit="never")  # type: ignore[arg-type]
+    pruning = CarryOptions(format=format, fine_tune="never")  # type: ignore[arg-type]
     hidden = keyss.hide(cover, asked, method=pruning, width=32, min_psnr=0)
     assert 250 < hidden.metrics.secret_gaussians[0] < 1000
 
@@ -51,5 +51,5 @@ def test_quantised_cover_keeps_its_codes(format: str, tmp_path: Path) -> None:
     path = tmp_path / f"cover{SUFFIXES[format]}"
     write_model(path, model_of(3000))
     model = read_model(path)
-    prepared = channel_for("as-is", format=format).prepare(model)
+    prepared = channel_for("unchanged", format=format).prepare(model)
     assert same_codes(prepared.codes, in_counted_order(model.codes)[1])  # type: ignore[attr-defined]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from keyss.channels import QuietReader
+from keyss.channels import LsbReader
 from keyss.core import Gaussians, WrongKeyError
 from keyss.files import read_model
 from methods.carry.carried import extract
@@ -23,7 +23,7 @@ STEGO = read_model(FOLDER / "carried.ply")
 
 
 def test_known_answer() -> None:
-    payload = QuietReader.of(STEGO).open(VECTOR["key"])
+    payload = LsbReader.of(STEGO).open(VECTOR["key"])
     assert payload.data.hex() == VECTOR["payload"]
     assert len(extract(STEGO, VECTOR["key"]).gaussians) == VECTOR["count"]
 
@@ -50,5 +50,5 @@ def test_pruned_model() -> None:
     order = torch.randperm(len(STEGO), generator=torch.Generator().manual_seed(0))
     carried = extract(STEGO[order[:300]], VECTOR["key"])
     assert len(carried.gaussians) == VECTOR["count"]
-    left, chunks = carried.chunks
-    assert 0.65 * chunks < left < 0.85 * chunks
+    left, shards = carried.shards
+    assert 0.65 * shards < left < 0.85 * shards

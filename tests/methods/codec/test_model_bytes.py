@@ -14,8 +14,8 @@ from hypothesis.extra import numpy as arrays
 from scipy.spatial.transform import Rotation
 
 import keyss
-from channels.quiet.coded import model_of
-from channels.quiet.trained_like import trained_like
+from channels.lsb.coded import model_of
+from channels.lsb.trained_like import trained_like
 from keyss import Secret
 from keyss.core import DRAWN_OPACITY, Camera, Gaussians, InputError, Scene, UsageError, View
 from keyss.files import write_model

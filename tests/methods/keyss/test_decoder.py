@@ -84,8 +84,8 @@ def test_gaussians_are_decoded_independently() -> None:
         assert moved > 1e-3 if released else moved < 1e-4
 
 
-def test_chunked_decoding(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Chunks bound the memory that a hostile file can request."""
+def test_sharded_decoding(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shards bound the memory that a hostile file can request."""
     decoder, stego = _decoder(released=True), random_gaussians()
     whole = decoder(stego, KEY)
     monkeypatch.setattr("keyss.methods.keyss.decoder.ROWS", 70)

@@ -11,7 +11,7 @@ import pytest
 import torch
 from hypothesis import given, settings, strategies as st
 
-from channels.quiet.trained_like import trained_like
+from channels.lsb.trained_like import trained_like
 from keyss.channels import Payload
 from keyss.core import InputError
 from keyss.core.similarity import Similarity

@@ -88,7 +88,7 @@ def test_appended_gaussians_are_not_decoded(hidden: Hidden) -> None:
     for secret in hidden.opened:
         revealed = secret.reveal(hidden.stego)
         assert revealed.digest() == secret.reveal(own).digest()
-        assert secret.remains(revealed).whole
+        assert secret.recovered(revealed).whole
         assert len(revealed) > 100
 
 
@@ -196,7 +196,7 @@ def test_state_after_growth_can_be_saved(tmp_path: Path) -> None:
 
 def test_invalid_options() -> None:
     for wrong, message in (
-        ({"publish": "any"}, "bit for bit"),
+        ({"publish": "converted"}, "bit for bit"),
         ({"design": "carriers"}, r"`carriers`|'carriers'.*published, released"),
         ({"mask": ()}, "none"),
         ({"mask": ("op", "colour")}, "colour"),

@@ -35,9 +35,9 @@ export function unpackPayload(packed: Uint8Array): Payload {
 export const ID_BYTES = 16;
 
 /**
- * The share, 0 to 1, of foreign Gaussians among those with `ids` [N, 16], by the sketch `own`; equal IDs count once.
- * `among`: places that each Gaussian hashes to, or for all of them the number of the sketch's Gaussians. 1 if less than a share
- * `gone` of the sketch's sample, rounded down, is there.
+ * The share, 0 to 1, of foreign Gaussians among those with `ids` [N, 16], by the Bloom filter `own`; equal IDs count once.
+ * `among`: places that each Gaussian hashes to, or for all of them the number of the Bloom filter's Gaussians. 1 if less than a share
+ * `gone` of the Bloom filter's sample, rounded down, is there.
  */
 export function foreignShare(
   secret: Uint8Array, ids: Uint8Array, own: Uint8Array, among: number | readonly number[], gone = 0,
@@ -46,7 +46,7 @@ export function foreignShare(
   const isUnset = (place: number): boolean => ((own[place >>> 3] >>> (place & 7)) & 1) === 0;
   const bits = typeof among === 'number' ? Math.min(kept, among) : kept;
   const unset = Array.from({ length: bits }, (_, place) => place).filter(isUnset).length;
-  const hashed = viewOf(encryptBlocks(expand(secret, 'sketch'), ids));
+  const hashed = viewOf(encryptBlocks(expand(secret, 'bloom'), ids));
   const sampled = new Map<number, number>(); // the place of each different ID
   for (let row = 0; row < ids.length / ID_BYTES; row++) {
     const [low, high] = [hashed.getUint32(ID_BYTES * row, true), hashed.getUint32(ID_BYTES * row + 4, true)];

@@ -10,11 +10,11 @@ import type { Derive } from '../keys/keys.ts';
 import { AppendedReader } from './appended/appended_reader.ts';
 import { copies, type Payload, type Reader } from './base.ts';
 import { ColoursReader } from './colours/colours_reader.ts';
-import { QuietReader } from './quiet/reading.ts';
+import { LsbReader } from './lsb/reading.ts';
 
 /** A model's channels, prepared for any number of keys: the quick ones, or the thorough search of colours. */
 export function preparedFor(model: ReadModel): (thorough: boolean) => Channels {
-  const quick = [QuietReader.of(model), AppendedReader.of(model)].filter((each) => each !== null);
+  const quick = [LsbReader.of(model), AppendedReader.of(model)].filter((each) => each !== null);
   let colours: Reader | null = null;
   return (thorough) => new Channels(thorough ? [(colours ??= ColoursReader.of(model))] : quick, model);
 }

@@ -6,7 +6,7 @@ import { tooMuchLost } from '../core/errors.ts';
 
 const ORDER = 65535; // of the generator 2
 const ZERO = 2 * ORDER; // logarithm of 0; POWERS of its sums with others are 0
-const MAX_CHUNKS = 1 << 13; // per codeword
+const MAX_SHARDS = 1 << 13; // per codeword
 const MAX_ERRORS = 128; // per codeword
 const COLUMNS = 64; // of all codewords in a line, restored at a time
 
@@ -19,7 +19,7 @@ for (let exponent = 0, value = 1; exponent < ORDER; exponent++) {
 }
 
 /** Field elements by index: sums of a Cantor basis. */
-const POINTS = new Uint16Array(2 * MAX_CHUNKS);
+const POINTS = new Uint16Array(2 * MAX_SHARDS);
 for (let size = 1, basis = 1; size < POINTS.length; size *= 2) {
   for (let at = 0; at < size; at++) POINTS[size + at] = POINTS[at] ^ basis;
   let root = 0;
@@ -32,7 +32,7 @@ function product(a: number, b: number): number {
 }
 
 /**
- * Data in `count` codewords of `n` chunks of `width` bytes (even), any `k` of which determine the codeword. Chunk i of
+ * Data in `count` codewords of `n` shards of `width` bytes (even), any `k` of which determine the codeword. Shard i of
  * codeword c has the number i x `count` + c.
  */
 export interface Codewords {
@@ -42,57 +42,57 @@ export interface Codewords {
   readonly width: number;
 }
 
-/** Chunks [n], null if lost, of one codeword. */
-type Chunks = (Uint8Array | null)[];
+/** Shards [n], null if lost, of one codeword. */
+type Shards = (Uint8Array | null)[];
 
 /**
- * The data from numbered chunks in any order. `errors`: some chunks may be wrong. Raises InputError for too few chunks.
+ * The data from numbered shards in any order. `errors`: some shards may be wrong. Raises InputError for too few shards.
  */
 export function decoded(
-  { count, n, k, width }: Codewords, chunks: Iterable<readonly [number, Uint8Array]>, errors = false,
+  { count, n, k, width }: Codewords, shards: Iterable<readonly [number, Uint8Array]>, errors = false,
 ): Uint8Array {
-  const left = new Map<number, Uint8Array | null>(); // null: different chunks claim this number
-  for (const [number, chunk] of chunks) {
+  const left = new Map<number, Uint8Array | null>(); // null: different shards claim this number
+  for (const [number, shard] of shards) {
     const other = left.get(number);
-    const alike = other === undefined || (other?.every((each, at) => each === chunk[at]) ?? false);
-    if (number < count * n) left.set(number, alike ? chunk : null);
+    const alike = other === undefined || (other?.every((each, at) => each === shard[at]) ?? false);
+    if (number < count * n) left.set(number, alike ? shard : null);
   }
   if (left.size < count * k) throw tooMuchLost(); // before allocating
   const data = new Uint8Array(count * k * width);
-  const incomplete: { chunks: Chunks; codeword: number }[] = [];
+  const incomplete: { shards: Shards; codeword: number }[] = [];
   for (let codeword = 0; codeword < count; codeword++) {
-    const own: Chunks = Array.from({ length: n }, (_, row) => left.get(row * count + codeword) ?? null);
+    const own: Shards = Array.from({ length: n }, (_, row) => left.get(row * count + codeword) ?? null);
     if (errors) dropErrors(own, k);
     if (own.reduce((sum, each) => sum + (each ? 1 : 0), 0) < k) throw tooMuchLost();
     for (let row = 0; row < k; row++) {
-      const chunk = own[row];
-      if (chunk) data.set(chunk, (row * count + codeword) * width);
+      const shard = own[row];
+      if (shard) data.set(shard, (row * count + codeword) * width);
     }
-    if (own.indexOf(null) >= 0 && own.indexOf(null) < k) incomplete.push({ chunks: own, codeword });
+    if (own.indexOf(null) >= 0 && own.indexOf(null) < k) incomplete.push({ shards: own, codeword });
   }
   const atOnce = Math.max(1, Math.floor((2 * COLUMNS) / width));
   for (let first = 0; first < incomplete.length; first += atOnce) {
     const some = incomplete.slice(first, first + atOnce);
-    restore(some.map((each) => each.chunks), k, width / 2, (own, row, chunk) => {
-      data.set(chunk, (row * count + some[own].codeword) * width);
+    restore(some.map((each) => each.shards), k, width / 2, (own, row, shard) => {
+      data.set(shard, (row * count + some[own].codeword) * width);
     });
   }
   return data;
 }
 
-/** Calls `put` with every lost one of the first k chunks of some codewords of `columns` symbols. */
+/** Calls `put` with every lost one of the first k shards of some codewords of `columns` symbols. */
 function restore(
-  codewords: Chunks[], k: number, columns: number, put: (codeword: number, row: number, chunk: Uint8Array) => void,
+  codewords: Shards[], k: number, columns: number, put: (codeword: number, row: number, shard: Uint8Array) => void,
 ): void {
   const size = sizeFor(codewords[0].length);
   const width = columns * codewords.length;
   const work = new Uint16Array(size * width);
-  const products = codewords.map((chunks, codeword) => {
-    const found = differences(size, (row) => !chunks[row]);
-    chunks.forEach((chunk, row) => {
-      if (!chunk) return;
+  const products = codewords.map((shards, codeword) => {
+    const found = differences(size, (row) => !shards[row]);
+    shards.forEach((shard, row) => {
+      if (!shard) return;
       for (let column = 0, to = row * width + codeword * columns; column < columns; column++) {
-        work[to + column] = POWERS[found[row] + LOGARITHMS[(chunk[2 * column] << 8) | chunk[2 * column + 1]]];
+        work[to + column] = POWERS[found[row] + LOGARITHMS[(shard[2 * column] << 8) | shard[2 * column + 1]]];
       }
     });
     return found;
@@ -100,16 +100,16 @@ function restore(
   toCoefficients(work, size, width);
   differentiate(work, size, width);
   toValues(work, size, width);
-  codewords.forEach((chunks, codeword) => {
+  codewords.forEach((shards, codeword) => {
     for (let row = 0; row < k; row++) {
-      if (chunks[row]) continue;
-      const chunk = new Uint8Array(2 * columns);
+      if (shards[row]) continue;
+      const shard = new Uint8Array(2 * columns);
       for (let column = 0, from = row * width + codeword * columns; column < columns; column++) {
         const symbol = POWERS[ORDER - products[codeword][row] + LOGARITHMS[work[from + column]]];
-        chunk[2 * column] = symbol >> 8;
-        chunk[2 * column + 1] = symbol & 255;
+        shard[2 * column] = symbol >> 8;
+        shard[2 * column + 1] = symbol & 255;
       }
-      put(codeword, row, chunk);
+      put(codeword, row, shard);
     }
   });
 }
@@ -191,19 +191,19 @@ function differentiate(work: Uint16Array, size: number, width: number): void {
   }
 }
 
-/** Sets chunks to null that do not belong to the codeword of the majority; all if there are too many errors. */
-function dropErrors(chunks: Chunks, k: number): void {
-  const rows = chunks.flatMap((chunk, row) => (chunk ? [row] : []));
+/** Sets shards to null that do not belong to the codeword of the majority; all if there are too many errors. */
+function dropErrors(shards: Shards, k: number): void {
+  const rows = shards.flatMap((shard, row) => (shard ? [row] : []));
   if (rows.length <= k) return;
-  const products = differences(sizeFor(chunks.length), (row) => Boolean(chunks[row]));
-  const powers = rows.map((row) => LOGARITHMS[POINTS[MAX_CHUNKS + row]]); // none is zero
-  const left = [...chunks];
+  const products = differences(sizeFor(shards.length), (row) => Boolean(shards[row]));
+  const powers = rows.map((row) => LOGARITHMS[POINTS[MAX_SHARDS + row]]); // none is zero
+  const left = [...shards];
   for (const step of [1, 2]) {
     const terms = rows.map((row) => {
-      const chunk = left[row]!;
+      const shard = left[row]!;
       let sum = 0;
-      for (let column = 0; 2 * column < chunk.length; column++) {
-        const symbol = (chunk[2 * column] << 8) | chunk[2 * column + 1];
+      for (let column = 0; 2 * column < shard.length; column++) {
+        const symbol = (shard[2 * column] << 8) | shard[2 * column + 1];
         sum ^= POWERS[LOGARITHMS[symbol] + ((step * column + ORDER - products[row]) % ORDER)];
       }
       return LOGARITHMS[sum];
@@ -215,7 +215,7 @@ function dropErrors(chunks: Chunks, k: number): void {
     rows.forEach((row, at) => {
       const inverse = ORDER - powers[at];
       const located = locator.reduce((sum, each, power) => sum ^ POWERS[LOGARITHMS[each] + ((power * inverse) % ORDER)], 0);
-      if (located === 0) chunks[row] = null;
+      if (located === 0) shards[row] = null;
     });
   }
 }

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from keyss.channels.appended import cover as cover_sketches, pilots
+from keyss.channels.appended import cover as cover_filters, pilots
 from keyss.channels.appended.words import (
     HEADERS,
     WORD_BITS,
@@ -66,7 +66,7 @@ _LEFT, _DEVIATIONS, _MAX_DATA = 0.74, 4.2, 5895
 _WIDE, _NARROW, _WIDE_PACKETS = 8, 6, 90_000
 _MAX_PACKETS = 1_000_000  # data packets; a header holds up to 2^20
 _STEP = 256  # smallest difference between numbers of appended Gaussians
-_OVERHEAD = OVERHEAD + METHOD_BYTES + 1 + cover_sketches.BYTES
+_OVERHEAD = OVERHEAD + METHOD_BYTES + 1 + cover_filters.BYTES
 
 # Search for the lattice's offset: Gaussians in which pilots are counted, maximum number of offsets, and
 # standard deviations by which pilots must outnumber accidental ones.
@@ -75,7 +75,7 @@ _ASSOCIATED = b"keyss/v1/appended/data"
 # Least share of foreign Gaussians that causes a warning. Conversions make none foreign; of another model,
 # 0.95 and more are.
 _FOREIGN = 0.05
-MAX_BYTES = _MAX_PACKETS * _NARROW - OVERHEAD - METHOD_BYTES - cover_sketches.BYTES
+MAX_BYTES = _MAX_PACKETS * _NARROW - OVERHEAD - METHOD_BYTES - cover_filters.BYTES
 _VISIBLE_SECRETS = (
     "the number of appended Gaussians reveals the total size: the holder of one key can tell that there are "
     "other secrets"
@@ -100,8 +100,8 @@ class Appended(Channel):
     def appended_count(self, sizes: Sequence[int]) -> int:
         """The number of Gaussians appended for payloads of these compressed sizes in bytes."""
         single = len(sizes) == 1
-        every = [_codewords_for(size + cover_sketches.BYTES, single) for size in sizes]
-        return _padded_count(sum(HEADERS + each.chunks for each in every))
+        every = [_codewords_for(size + cover_filters.BYTES, single) for size in sizes]
+        return _padded_count(sum(HEADERS + each.shards for each in every))
 
 
 APPENDED = Appended()
@@ -132,7 +132,7 @@ class AppendedCover:
         total = APPENDED.appended_count([compressed_size(each) for each in packed])
         words = [pilots.write(salt, pilots.count_for(total), random)]
         for key, each in zip(keys, packed, strict=True):
-            own = cover_sketches.pack(model, total, to_world.inverse(), _sketch_key(key))
+            own = cover_filters.pack(model, total, to_world.inverse(), _filter_key(key))
             words.append(_words(key, own, each, len(keys) == 1))
         words.append(_random_words(secret, total - sum(map(len, words))))
         # In random order, because sorting keeps the order of equal rotations.
@@ -178,17 +178,17 @@ class AppendedReader(SaltedReader):
             if header:
                 numbers, data = read_packets(key.expand("appended/packets", 32), self.words, width)
                 whole = _codewords(header, width).decode(numbers.astype(np.int64), data, errors=True)
-                own = _masked(key, whole[: cover_sketches.BYTES])
-                encrypted = whole[cover_sketches.BYTES :]
+                own = _masked(key, whole[: cover_filters.BYTES])
+                encrypted = whole[cover_filters.BYTES :]
                 packed = decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED + own)
-                foreign = cover_sketches.foreign_count(
-                    own, self.model, self.to_own, _sketch_key(key), _FOREIGN
+                foreign = cover_filters.foreign_count(
+                    own, self.model, self.to_own, _filter_key(key), _FOREIGN
                 )
                 return replace(unpack_payload(packed), foreign=foreign)
         raise WrongKeyError()
 
 
-def _sketch_key(key: DerivedKey) -> bytes:
+def _filter_key(key: DerivedKey) -> bytes:
     return key.expand("appended/host", 32)
 
 
@@ -237,14 +237,14 @@ def _shifts_with_pilots(steps: Doubles, colours: Integers) -> Iterator[float]:
 def _words(key: DerivedKey, own: bytes, packed: bytes, single: bool) -> Bits:
     """Words [N, WORD_BITS] of the headers and packets of a payload; `single`: there is only one secret.
 
-    `own`: the cover's sketch, which is masked and authenticated with the payload.
+    `own`: the cover's Bloom filter, which is masked and authenticated with the payload.
     """
     codewords = _codewords_for(compressed_size(packed) + len(own), single)
     width, needed = codewords.width, codewords.count * codewords.k
     size = codewords.size - len(own)
     encrypted = encrypt(key.expand("appended/data", 32), packed, _ASSOCIATED + own, size=size)
     data = _masked(key, own) + encrypted
-    numbers = np.arange(codewords.chunks, dtype=np.uint64)
+    numbers = np.arange(codewords.shards, dtype=np.uint64)
     noise = np.frombuffer(key.expand("appended/header-noise", HEADERS * width), np.uint8).reshape(
         HEADERS, width
     )
@@ -257,7 +257,7 @@ def _words(key: DerivedKey, own: bytes, packed: bytes, single: bool) -> Bits:
 
 
 def _masked(key: DerivedKey, own: bytes) -> bytes:
-    """The cover's sketch, encrypted or decrypted."""
+    """The cover's Bloom filter, encrypted or decrypted."""
     mask = np.frombuffer(stream(key.master, "appended/cover", len(own)), np.uint8)
     return (np.frombuffer(own, np.uint8) ^ mask).tobytes()
 

@@ -1,13 +1,13 @@
-"""What a payload knows of its cover: a sketch of its Gaussians, as formats and motions leave them.
+"""What a payload knows of its cover: a Bloom filter of its Gaussians, as formats and motions leave them.
 
 Numbers of a Gaussian in the own frame (position, log scales, opacity, colours) are rounded to coarse *bins*.
 Borders depend on the key, and those of numbers other than positions also on the position's bin: nobody else
 can move Gaussians next to them, and equal numbers are next to a border in few places only. A reader leaves
 out Gaussians next to a border, which a format may have moved across it; a writer leaves out none.
 
-Of the sketch's sample, half is drawn by number, half by size: an attacker who adds few Gaussians that cover
+Of the filter's sample, half is drawn by number, half by size: an attacker who adds few Gaussians that cover
 much, or many specks, is noticed alike. The IDs fix sizes and places relative to the appended Gaussians, so
-the cover's own Gaussians count only where and as large as they were, once each. Gaussians that the sketch
+the cover's own Gaussians count only where and as large as they were, once each. Gaussians that the filter
 cannot tell apart are counted: those too faint for it, because many in one place are visible, and those out of
 the bins' range, into which a model that is far larger or smaller than the cover falls as a whole.
 """
@@ -35,9 +35,9 @@ _HIGH = np.array([7.0] * 3 + [4.0] * 3 + [1.0] + [1.7] * 3)
 _VISIBLE = np.array([2.0, 3.5]) / 255
 _MORE = 1.25  # factor by which formats may increase the number of faint Gaussians
 _GONE = 0.02  # share of the sample; readers of whole covers leave out at most four fifths
-_SKETCH_BYTES = 128
-# Numbers of faint Gaussians, of those out of range and of all others than faint; area; sketch.
-_FORMAT = struct.Struct(f"<IIIf{_SKETCH_BYTES}s")
+_BLOOM_BYTES = 128
+# Numbers of faint Gaussians, of those out of range and of all others than faint; area; Bloom filter.
+_FORMAT = struct.Struct(f"<IIIf{_BLOOM_BYTES}s")
 BYTES = _FORMAT.size
 
 
@@ -80,11 +80,11 @@ class _Rows:
         return _Rows(ids.view(np.uint8), areas, outside)
 
     def among(self, count: int, area: float) -> Integers:
-        """Places in the sketch of a cover with `count` Gaussians and a total `area`."""
+        """Places in the Bloom filter of a cover with `count` Gaussians and a total `area`."""
         return (
             np.rint(2 / (1 / max(1, count) + self.areas / max(1e-30, area)))
             .astype(np.int64)
-            .clip(8 * _SKETCH_BYTES)
+            .clip(8 * _BLOOM_BYTES)
         )
 
 
@@ -92,7 +92,7 @@ def pack(cover: Gaussians, appended: int, to_own: Similarity, secret: bytes) -> 
     """BYTES bytes by which `foreign_count` detects Gaussians other than the cover's and those `appended`."""
     rows = _Rows.of(cover, to_own, secret, reading=False)
     area = float(np.float32(rows.areas.sum()))
-    own = mixing.sketch(secret, rows.ids, _SKETCH_BYTES, rows.among(len(rows.ids), area))
+    own = mixing.bloom_filter(secret, rows.ids, _BLOOM_BYTES, rows.among(len(rows.ids), area))
     return _FORMAT.pack(_faint(cover) + appended, rows.outside, len(rows.ids), area, own)
 
 

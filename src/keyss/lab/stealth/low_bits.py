@@ -10,7 +10,7 @@
   Embedding makes their other bits random, unless neither Gaussian is a carrier. The null for pairs with a
   usable Gaussian is exact: independent low bits.
 - `steps`: siblings that moved apart by equal steps of Adam, so that numbers predict each other's low bits
-  (`keyss.channels.quiet.equal_steps`). A hit is a difference between neighbours that agrees to 1/8 of a cell
+  (`keyss.channels.lsb.equal_steps`). A hit is a difference between neighbours that agrees to 1/8 of a cell
   (the range of low bits) with that of another number of its group, or with that of the constant colour
   divided by the ratio of their rates. Candidates are found by the bits that stay. The null distribution comes
   from the same file with other low bits in usable Gaussians.

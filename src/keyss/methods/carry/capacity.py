@@ -18,7 +18,7 @@ from keyss.rendering.orbit import Viewpoints
 _BITS_PER_GAUSSIAN = 150, 210  # of a secret that is not fitted yet, with the usual and the finest precision
 _SAMPLE, _FAR_TOO_LARGE = 10_000, 1.5  # Gaussians; times what can be appended
 _TINY = 16  # Gaussians; secrets are not pruned to fewer
-_ANY = '`publish="any"` has room for all'
+_ANY = '`publish="converted"` has room for all'
 
 
 @dataclass(frozen=True)

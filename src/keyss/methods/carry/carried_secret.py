@@ -10,7 +10,7 @@ from keyss.channels import Payload
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.methods.codec.model_bytes import decode
-from keyss.methods.hidden import Frame, HiddenScene, Remains
+from keyss.methods.hidden import Frame, HiddenScene, Recovered
 
 
 @dataclass(frozen=True)
@@ -18,13 +18,13 @@ class CarriedSecret(HiddenScene):
     """A carried secret."""
 
     gaussians: Gaussians
-    chunks: tuple[int, int] | None = None  # see `Payload`
+    shards: tuple[int, int] | None = None  # see `Payload`
     frame = None
 
     @staticmethod
     def of(payload: Payload) -> CarriedSecret:
         """Read a payload. Raises InputError for damage."""
-        return CarriedSecret(decode(payload.data, payload.model_size), payload.chunks)
+        return CarriedSecret(decode(payload.data, payload.model_size), payload.shards)
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         """All Gaussians of the secret."""
@@ -40,8 +40,8 @@ class CarriedSecret(HiddenScene):
             )
         return self.gaussians
 
-    def remains(self, revealed: Gaussians) -> Remains:
-        return Remains(len(revealed), len(revealed), self.chunks)
+    def recovered(self, revealed: Gaussians) -> Recovered:
+        return Recovered(len(revealed), len(revealed), self.shards)
 
     def fingerprint(self) -> str:
         return hashlib.sha256(self.gaussians.means.numpy().tobytes()).hexdigest()[:16]

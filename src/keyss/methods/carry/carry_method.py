@@ -17,21 +17,21 @@ from keyss.fitting.plain import fit_scene
 from keyss.fitting.schedule import boost_of
 from keyss.methods.carry.capacity import CarryCapacity, SecretSize, shares, warn_of_sharing
 from keyss.methods.carry.carried_secret import CarriedSecret
-from keyss.methods.carry.carry_options import REFIT, CarryOptions
+from keyss.methods.carry.carry_options import FINE_TUNING, CarryOptions
 from keyss.methods.codec.precision import encode_to_size, finest_size
 from keyss.methods.method import Capabilities, Context, Plan, Source, Stego, role_of, seconds_to_hide
 from keyss.rendering import contributions
 from keyss.rendering.orbit import Viewpoints
 
-# Refits to renders start near the optimum: maximum steps, and factor on the rates.
+# Fine-tuning to renders starts near the optimum: maximum steps, and factor on the rates.
 _MODEL_ITERATIONS, _MODEL_RATE = 400, 0.1
 _SELECTION_VIEWS = 64
 _VISIBLE = (
     "the cover can hold the secret, but whoever inspects the published file sees that it holds something "
-    '(`publish="any"`), because it cannot be hidden unnoticed: {}'
+    '(`publish="converted"`), because it cannot be hidden unnoticed: {}'
 )
-_REFIT_SHARE = 0.97  # refit size / Gaussians that fit: refitted Gaussians compress a little worse
-_MIN_SHARE = 1 / 6  # of a secret's Gaussians; refits of public models with fewer are below 30 dB
+_FINE_TUNED_SHARE = 0.97  # Gaussians after fine-tuning / that fit: they compress a little worse then
+_MIN_SHARE = 1 / 6  # of a secret's Gaussians; public models fine-tuned with fewer are below 30 dB
 
 
 class CarryMethod:
@@ -43,10 +43,10 @@ class CarryMethod:
     options = CarryOptions
 
     def prepare(self, sources: Sequence[Source], options: CarryOptions) -> CarryOptions:
-        """Set the steps of refits; a second call, with fitted models, only adds refits.
+        """Set the steps of fine-tuning; a second call, with fitted models, only adds some.
 
-        If secrets cannot be hidden unnoticed, `publish` becomes "any", with a warning, where `may_show`.
-        Otherwise raises UsageError.
+        If secrets cannot be hidden unnoticed, `publish` becomes "converted", with a warning, where
+        `may_show`. Otherwise raises UsageError.
         """
         cover, *secrets = sources
         secret_sizes = _secret_sizes(secrets, options)
@@ -62,20 +62,23 @@ class CarryMethod:
             if not options.may_show:
                 raise
             warnings.warn(_VISIBLE.format(refused.__cause__ or refused), KeyssWarning, stacklevel=2)
-            return self.prepare(sources, replace(options, publish="any"))
+            return self.prepare(sources, replace(options, publish="converted"))
         cut = [size < secret.count for size, secret in zip(sizes, secret_sizes, strict=True)]
-        if options.refit == "always":
+        if options.fine_tune == "always":
             cut = [True] * len(cut)
-        elif options.refit == "never":
+        elif options.fine_tune == "never":
             cut = [False] * len(cut)
-        steps = round(REFIT * options.fit.iterations)
-        refits = [
+        steps = round(FINE_TUNING * options.fit.iterations)
+        fine_tuning_steps = [
             options.iterations or (steps if secret.photos else min(options.fit.iterations, _MODEL_ITERATIONS))
             for secret in secrets
         ]
-        planned = options.refits or (0,) * len(cut)  # by the first call
+        planned = options.fine_tuning_steps or (0,) * len(cut)  # by the first call
         return replace(
-            options, refits=tuple(p or (n if c else 0) for p, n, c in zip(planned, refits, cut, strict=True))
+            options,
+            fine_tuning_steps=tuple(
+                p or (n if c else 0) for p, n, c in zip(planned, fine_tuning_steps, cut, strict=True)
+            ),
         )
 
     def plan(self, sources: Sequence[Source], options: CarryOptions) -> Plan:
@@ -105,7 +108,7 @@ class CarryMethod:
     def hide(
         self, cover: Source, secrets: Sequence[Source], options: CarryOptions, context: Context
     ) -> Stego:
-        """Refit the secrets that need it, embed all, and open each again to check.
+        """Fine-tune the secrets that need it, embed all, and open each again to check.
 
         Raises UsageError for a cover without capacity, Interrupted on Ctrl-C, and InputError for a
         checkpoint of another run.
@@ -115,15 +118,17 @@ class CarryMethod:
         plain = [secret.model for secret in secrets]
         viewpoints = [Viewpoints.of(secret.scene) for secret in secrets]
         models = list(plain)
-        if any(options.refits):
+        if any(options.fine_tuning_steps):
             fitting = capacity.prune(plain, viewpoints)
-            for index, (secret, steps, fits) in enumerate(zip(secrets, options.refits, fitting, strict=True)):
+            for index, (secret, steps, fits) in enumerate(
+                zip(secrets, options.fine_tuning_steps, fitting, strict=True)
+            ):
                 if steps:
                     cut = len(fits) < len(secret.model)
-                    models[index] = refit(
+                    models[index] = fine_tune(
                         secret.model.with_sh_degree(fits.sh_degree),
                         secret.scene,
-                        max(1, int(_REFIT_SHARE * len(fits))) if cut else len(fits),
+                        max(1, int(_FINE_TUNED_SHARE * len(fits))) if cut else len(fits),
                         replace(options.fit, iterations=steps),
                         context,
                         photos=secret.photos,
@@ -138,7 +143,7 @@ class CarryMethod:
                 viewpoints=viewpoints,
                 entropy=context.entropy,
             )
-        return replace(stego, iterations=max(options.refits), details={**details, **stego.details})
+        return replace(stego, iterations=max(options.fine_tuning_steps), details={**details, **stego.details})
 
 
 def _secret_sizes(secrets: Sequence[Source], options: CarryOptions) -> list[SecretSize]:
@@ -158,7 +163,7 @@ def _check_share(secrets: Sequence[SecretSize], sizes: Sequence[int]) -> None:
 METHOD = CarryMethod()
 
 
-def refit(
+def fine_tune(
     secret: Gaussians,
     scene: Scene,
     count: int,
@@ -174,12 +179,12 @@ def refit(
     """
     return fit_scene(
         scene,
-        # A refit must not depend on the other secrets.
+        # Fine-tuning must not depend on the other secrets.
         replace(fit, seed=fit.seed_of(name)),
         model=most_contributing(secret, scene, count),
         rate=boost_of(fit) if photos else _MODEL_RATE,
         device=context.device,
-        title=f"refit of the {name}",
+        title=f"fine-tuning of the {name}",
         **context.loop_arguments(name.replace(" ", "-")),
     ).gaussians
 

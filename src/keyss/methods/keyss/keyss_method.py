@@ -31,7 +31,7 @@ from keyss.core.similarity import Similarity
 from keyss.keys import DerivedKey
 from keyss.keys.clip import MODEL, ClipKeys, clip_keys
 from keyss.keys.derivation import SALT_BYTES, expand, stream
-from keyss.methods.hidden import Frame, HiddenScene, Remains
+from keyss.methods.hidden import Frame, HiddenScene, Recovered
 from keyss.methods.keyss.decoder import Decoder
 from keyss.methods.keyss.keyss_options import DecoderShape, KeyssOptions, parse_mask
 from keyss.methods.keyss.training import KeyssTraining
@@ -153,7 +153,7 @@ class KeyssSecret(HiddenScene):
     frame: Similarity  # secret frame to cover frame
     anchors: Tensor  # [A, 3] positions of Gaussians of the stego model
     count: int = 0  # Gaussians revealed from a complete file; 0: unknown
-    chunks: tuple[int, int] | None = None  # see `Payload`; not packed
+    shards: tuple[int, int] | None = None  # see `Payload`; not packed
 
     def payload(self) -> Payload:
         """The payload for a channel; the same secret gives the same bytes."""
@@ -179,7 +179,7 @@ class KeyssSecret(HiddenScene):
             decoder = Decoder(shape)
             decoder.load_state_dict({name.removeprefix(_WEIGHTS): value for name, value in tensors.items()})
         decoder.requires_grad_(False)
-        return KeyssSecret(decoder, key, header.frame, anchors, header.count, payload.chunks)
+        return KeyssSecret(decoder, key, header.frame, anchors, header.count, payload.shards)
 
     @torch.no_grad()
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
@@ -200,9 +200,9 @@ class KeyssSecret(HiddenScene):
         own = stego[~is_appended(stego)].with_sh_degree(decoder.shape.sh_degree)
         return decoder(own, key.to(stego.device))  # type: ignore[no-any-return]
 
-    def remains(self, revealed: Gaussians) -> Remains:
-        """See `HiddenScene.remains`; Gaussians that are never rendered do not count."""
-        return Remains(count_visible(revealed), self.count, self.chunks, _SLACK)
+    def recovered(self, revealed: Gaussians) -> Recovered:
+        """See `HiddenScene.recovered`; Gaussians that are never rendered do not count."""
+        return Recovered(count_visible(revealed), self.count, self.shards, _SLACK)
 
     def fingerprint(self) -> str:
         return hashlib.sha256(self.payload().data).hexdigest()[:16]

@@ -137,8 +137,8 @@ class JointOptions(MethodOptions):
     def __post_init__(self) -> None:
         """Raise UsageError if the model would be published in a lossy format."""
         super().__post_init__()
-        if self.publish == "any" or self.format not in (None, "ply"):
-            option = 'publish="any"' if self.publish == "any" else f'format="{self.format}"'
+        if self.publish == "converted" or self.format not in (None, "ply"):
+            option = 'publish="converted"' if self.publish == "converted" else f'format="{self.format}"'
             raise UsageError(
                 f"`{option}`: this method needs the published model bit for bit: leave it out, or use "
                 '`method="carry"`'

@@ -1,4 +1,4 @@
-/** What a payload knows of its cover: a sketch of its Gaussians; counterpart of `keyss.channels.appended.cover`. */
+/** What a payload knows of its cover: a Bloom filter of its Gaussians; counterpart of `keyss.channels.appended.cover`. */
 import { viewOf } from '../../core/bytes.ts';
 import { coefficients, type Gaussians, opacity } from '../../core/gaussians.ts';
 import { movedPoint, type Similarity } from '../../core/similarity.ts';
@@ -12,13 +12,13 @@ const ERRORS = [0.002, 0.002, 0.002, 0.035, 0.035, 0.035, 0.005, 0.016, 0.016, 0
 const LOW = [-7, -7, -7, -8, -8, -8, 0, -1.7, -1.7, -1.7]; // formats may clip numbers outside of these
 const HIGH = [7, 7, 7, 4, 4, 4, 1, 1.7, 1.7, 1.7];
 const VISIBLE = 3.5 / 255; // minimum opacity; 8 bits round none across it
-const SKETCH_BYTES = 128;
+const BLOOM_BYTES = 128;
 
 const [MORE, GONE] = [1.25, 0.02]; // factor by which formats may increase the number of faint Gaussians; share of the sample
-const SKETCH = 16; // after four numbers
+const BLOOM = 16; // after four numbers
 const POSITIONS = 3; // the first numbers
 
-export const COVER_BYTES = SKETCH + SKETCH_BYTES;
+export const COVER_BYTES = BLOOM + BLOOM_BYTES;
 
 /** About how many of a model's Gaussians are foreign to the cover that `packed` describes; 0 if they are at most a `share`. */
 export function foreignCount(packed: Uint8Array, model: Gaussians, toOwn: Similarity, secret: Uint8Array, share: number): number {
@@ -38,11 +38,11 @@ export function foreignCount(packed: Uint8Array, model: Gaussians, toOwn: Simila
     const [, b, c] = middles.slice(3, 6).sort((x, y) => x - y);
     const size = Math.exp(b + c) * Math.max(0.02, Math.min(1, middles[6])) / area;
     ids.set(bins, ID_BYTES * among.length);
-    among.push(Math.max(8 * SKETCH_BYTES, Math.round(2 / (1 / count + size))));
+    among.push(Math.max(8 * BLOOM_BYTES, Math.round(2 / (1 / count + size))));
   }
   const own = new Uint8Array(ids.buffer, 0, ID_BYTES * among.length);
   const visible = model.count - faint;
-  const found = foreignShare(secret, own, packed.subarray(SKETCH), among, GONE);
+  const found = foreignShare(secret, own, packed.subarray(BLOOM), among, GONE);
   let sure = found > share ? Math.round(found * visible) : 0;
   const outside = rows.filter(isOutside).length;
   if (outside > outsideBefore + share * visible) sure = Math.max(sure, outside - outsideBefore);

@@ -1,0 +1,283 @@
+"""The header of a secret in low bits, and the division of carriers between secrets.
+
+A secret has a *header* of short messages (see `spread`): its data key, encrypted for each salt, and its
+parameters. Its payload is cut into shards with Reed-Solomon redundancy, one in each carrier of its share: any
+quarter of all Gaussians may be lost. The number of shards does not reveal the size of the payload.
+
+A *share* is a part of the carriers at a depth. A key must not reveal whether there are other secrets, so a
+secret's share depends on its own size only: the first that holds it of a quarter, a half and all of the
+carriers at the least depth, and all of them at each larger one. Places for the headers of four secrets are
+reserved, however many there are. Secrets whose shares do not fit together get equal ones at the least depth
+at which they fit, by which the holder of one key can notice others.
+
+Numbers are little-endian. The parameters:
+
+    check (8 bytes, derived from the data key), version (1), method (15, padded with zeros), bytes of the
+    encrypted payload (4), depth (1), Gaussians of the model (4), codewords (4), shards of one (2), data
+    shards of one (2), a Bloom filter of the Gaussians (see `mixing`)
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from keyss.channels.base import METHOD_BYTES, Capacity, pack_method, unpack_method
+from keyss.channels.lsb.bits import DEPTHS, LEAST, Layout
+from keyss.channels.lsb.spread import (
+    Message,
+    Shards,
+    false_shards,
+    groups_of,
+    is_tagged,
+    shard_bytes,
+    whole_groups,
+)
+from keyss.channels.lsb.usable import SALTS
+from keyss.channels.mixing import BLOOM_BYTES
+from keyss.channels.reed_solomon import LOST, Codewords
+from keyss.core.errors import InputError, UsageError
+from keyss.keys.derivation import DerivedKey, expand
+from keyss.keys.encryption import OVERHEAD
+
+DATA_KEY_BYTES = 16
+# Places of each part of a data key, for each salt, and of each part of the parameters; two that can be read
+# suffice. With 60 % of the Gaussians usable and a quarter lost, fewer are left with p = 0.8 % and 1e-7.
+_KEY_COPIES, _PARAMETER_COPIES = 12, 32
+TYPICAL_SHARE = 0.75  # usable Gaussians of a trained model; 0.40 to 1.00 were measured
+
+MAX_INDEPENDENT = 4  # maximum number of secrets with independent shares
+_MAX_RESERVED = 1 / 3  # maximum share of the carriers reserved for headers
+_REMOVAL = 0.25  # share of the Gaussians that may be removed at random
+_FAILURE = 1e-7  # probability of losing a payload to such removal
+_LONGEST = 1024  # shards per codeword; longer codewords hold little more and are slower
+_SPREAD = 4  # standard deviations by which a group may be smaller than the mean
+_FALSE_COST = 1.5  # shards that a false one costs: one that it contradicts, or two where it is an error
+MAX_CODEWORDS = 1 << 14
+
+_VERSION = 7
+_CHECK_BYTES = 8
+_PREFIX = struct.Struct(f"<B{METHOD_BYTES}sIBIIHH")
+_SIZE = _CHECK_BYTES + _PREFIX.size + BLOOM_BYTES
+_DAMAGED = "the hidden parameters are damaged"
+
+
+@dataclass(frozen=True)
+class Share:
+    """Carriers of a secret, and the codewords in them."""
+
+    carriers: int
+    codewords: Codewords
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The division of carriers between payloads."""
+
+    depth: int
+    shares: list[Share]  # of each payload
+    independent: bool  # True if no share depends on other secrets
+
+
+@dataclass(frozen=True)
+class LowBitsCapacity:
+    """The capacity of the low bits of a model of `gaussians`, with so many `carriers` by depth."""
+
+    gaussians: int
+    carriers: Mapping[int, int]
+    layout: Layout
+
+    @staticmethod
+    def of(gaussians: int, layout: Layout) -> LowBitsCapacity:
+        """An estimate."""
+        return LowBitsCapacity(gaussians, dict.fromkeys(DEPTHS, int(TYPICAL_SHARE * gaussians)), layout)
+
+    def for_payloads(self) -> Capacity:
+        ladder = self._ladder or [(1.0, 0, depth) for depth in self.carriers]
+        steps = [(part, self._size(count, depth)) for part, count, depth in ladder]
+        if not self._ladder:
+            steps = [(1.0, self.payload_capacity(1))]
+        return Capacity(
+            steps[-1][1],
+            OVERHEAD,
+            equal=self.payload_capacity,
+            steps=tuple(steps),
+            divisible=bool(self._ladder),
+        )
+
+    @property
+    def header_carriers(self) -> int:
+        """Gaussians that the header of a secret takes at most."""
+        width = self.layout.width(LEAST)
+        return SALTS * key_message(b"", width).places + parameter_message(b"", width).places
+
+    def plan(self, sizes: Sequence[int]) -> Plan:
+        """Shares for encrypted payloads of `sizes` bytes.
+
+        Raises UsageError, with the number of Gaussians that would suffice.
+        """
+        ladder = self._ladder if len(sizes) <= MAX_INDEPENDENT else []
+        found = [next((each for each in ladder if self._size(*each[1:]) >= size), None) for size in sizes]
+        fitting = [each for each in found if each is not None]
+        if len(fitting) == len(sizes) and sum(part for part, _, _ in fitting) <= 1:
+            return Plan(max(depth for _, _, depth in fitting), self._shares(fitting, sizes), True)
+        for depth in self.carriers:
+            equal = (1 / len(sizes), self._equal(len(sizes), depth), depth)
+            if self._size(*equal[1:]) >= max(sizes):
+                return Plan(depth, self._shares([equal] * len(sizes), sizes), False)
+        raise UsageError(self.too_small(max(sizes), len(sizes)))
+
+    def payload_capacity(self, secrets: int) -> int:
+        """Maximum bytes of each of `secrets` encrypted payloads with equal shares; may be 0."""
+        return max(self._size(self._equal(secrets, depth), depth) for depth in self.carriers)
+
+    def too_small(self, size: int, secrets: int) -> str:
+        """The message for payloads of `size` bytes that do not fit."""
+
+        def capacity(gaussians: int) -> int:
+            carriers = {d: gaussians * c // max(1, self.gaussians) for d, c in self.carriers.items()}
+            return LowBitsCapacity(gaussians, carriers, self.layout).payload_capacity(secrets)
+
+        need = bisect_left(range(_LONGEST * MAX_CODEWORDS), size, key=capacity)
+        digits = max(0, len(str(need)) - 2)
+        rounded = math.ceil(need / 10**digits) * 10**digits
+        each = "" if secrets == 1 else f" for each of {secrets} secrets"
+        return (
+            f"a cover of {self.gaussians:,} Gaussians is too small to carry {size:,} bytes{each} in its low "
+            f"bits; {rounded:,} Gaussians would do"
+        )
+
+    @property
+    def _ladder(self) -> list[tuple[float, int, int]]:
+        """Part of the carriers, carriers and depth of each share, in the order of capacity.
+
+        Empty if the headers of four secrets would take too many carriers.
+        """
+        reserved, steps = MAX_INDEPENDENT * self.header_carriers, list[tuple[float, int, int]]()
+        for part, depth in ((0.25, LEAST), (0.5, LEAST), *((1.0, depth) for depth in self.carriers)):
+            count = int(part * (self.carriers[depth] - reserved))
+            if reserved > _MAX_RESERVED * self.carriers[depth]:
+                continue
+            if self._size(count, depth) > (self._size(*steps[-1][1:]) if steps else 0):
+                steps.append((part, count, depth))
+        return steps
+
+    def _equal(self, secrets: int, depth: int) -> int:
+        """Carriers for the shards of each of `secrets` payloads with equal shares."""
+        return max(0, self.carriers[depth] // secrets - self.header_carriers)
+
+    def _shares(self, steps: Sequence[tuple[float, int, int]], sizes: Sequence[int]) -> list[Share]:
+        shares = []
+        for (_, count, depth), size in zip(steps, sizes, strict=True):
+            codewords = self._codewords(count, depth, size)
+            assert codewords is not None  # the size was compared with the capacity
+            shares.append(Share(count, codewords))
+        return shares
+
+    def _size(self, count: int, depth: int) -> int:
+        """Maximum bytes of an encrypted payload in `count` carriers at a depth."""
+        codewords = self._codewords(count, depth)
+        return codewords.size if codewords else 0
+
+    def _codewords(self, count: int, depth: int, size: int | None = None) -> Codewords | None:
+        """The most redundant code of `size` bytes (None: the maximum) in `count` carriers at a depth.
+
+        None if its probability of loss exceeds _FAILURE.
+        """
+        width = self.layout.width(depth)
+        shard, tagged = shard_bytes(width), is_tagged(width)
+        if count < 1 or shard < 1:
+            return None
+        number = whole_groups(-(-count // _LONGEST), tagged)
+        groups = groups_of(number, tagged)
+        if number > MAX_CODEWORDS:
+            return None
+        mean = count / groups
+        n = int((mean if groups == 1 else mean - _SPREAD * mean**0.5) * groups / number)
+        lost = _REMOVAL + _FALSE_COST * false_shards(self.gaussians - count, groups, tagged)
+        most = _most_data(n, number, round(lost, 4))
+        k = most if size is None else max(1, -(-size // (shard * number)))
+        return Codewords(number, n, k, shard) if 0 < k <= most else None
+
+
+def check_payload_fits(compressed: int, gaussians: int, secrets: int, sh_degree: int) -> None:
+    """Raise UsageError if `compressed` bytes per secret will probably not fit into a model to be trained."""
+    size, capacity = compressed + OVERHEAD, LowBitsCapacity.of(gaussians, Layout(sh_degree))
+    if capacity.payload_capacity(secrets) < size:
+        raise UsageError(capacity.too_small(size, secrets))
+
+
+def key_message(secret: bytes, width: int) -> Message:
+    """The message of a data key under the secret of a key, in rows of `width` bytes at the least depth."""
+    return Message(secret, "key", DATA_KEY_BYTES, min(width, DATA_KEY_BYTES), _KEY_COPIES)
+
+
+def key_secret(key: DerivedKey) -> bytes:
+    """The secret of `key_message`."""
+    return key.expand("lsb/key", 32)
+
+
+def parameter_message(data_key: bytes, width: int) -> Message:
+    """The message of the parameters, in rows of `width` bytes at the least depth."""
+    return Message(data_key, "parameters", _SIZE, width, _PARAMETER_COPIES)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of a secret."""
+
+    method: str
+    size: int  # bytes of the encrypted payload
+    depth: int
+    gaussians: int  # size of the published model
+    codewords: Codewords
+    bloom: bytes
+
+    def pack(self, data_key: bytes) -> bytes:
+        code, name = self.codewords, pack_method(self.method)
+        fields = (self.size, self.depth, self.gaussians, code.count, code.n, code.k)
+        return _check(data_key) + _PREFIX.pack(_VERSION, name, *fields) + self.bloom
+
+    def shards(self, data_key: bytes, layout: Layout) -> Shards:
+        """The shards of the payload."""
+        return Shards(data_key, self.codewords, is_tagged(layout.width(self.depth)))
+
+    @staticmethod
+    def unpack(packed: bytes, data_key: bytes, layout: Layout) -> Parameters | None:
+        """None if the data key is wrong. Raises InputError for damage or loss."""
+        if packed[:_CHECK_BYTES] != _check(data_key):
+            return None
+        version, name, size, depth, gaussians, count, n, k = _PREFIX.unpack_from(packed, _CHECK_BYTES)
+        if version != _VERSION:
+            raise InputError(f"hidden secret of version {version}; this program reads version {_VERSION}")
+        try:
+            width = layout.width(depth) if depth in DEPTHS else 0
+            whole = 0 < count <= MAX_CODEWORDS and count == whole_groups(count, is_tagged(width))
+            if not whole or n > _LONGEST:
+                raise ValueError(f"{count} codewords of {n} shards at depth {depth}")
+            codewords = Codewords(count, n, k, shard_bytes(width))
+            method = unpack_method(name)
+        except ValueError as error:
+            raise InputError(f"{_DAMAGED}: {error}; {LOST}") from error
+        if not 0 < size <= codewords.size:
+            raise InputError(f"{_DAMAGED}: {size} bytes in {codewords}")
+        return Parameters(method, size, depth, gaussians, codewords, packed[-BLOOM_BYTES:])
+
+
+def _check(data_key: bytes) -> bytes:
+    return expand(data_key, "lsb/check", _CHECK_BYTES)
+
+
+@lru_cache(maxsize=4096)
+def _most_data(n: int, count: int, lost: float) -> int:
+    """The largest k with which all codewords survive, each shard being lost with a probability; 0 if none."""
+    from scipy.special import bdtrc  # takes long to load
+
+    data = np.arange(1, n + 1)
+    return int(data[bdtrc(n - data, n, lost) * count < _FAILURE].max(initial=0)) if lost < 1 else 0

@@ -1,0 +1,278 @@
+"""Usable Gaussians, whose low bits can be replaced without a trace, and those that give the salts.
+
+In a trained model most low bits are uniformly random to anybody who does not know the training, but not all.
+A Gaussian is excluded as a whole, so that its numbers stay consistent, because of:
+
+- *Equal steps* away from zero or a neighbour: see `equal_steps`. These are also the harmonics of Gaussians
+  that no view shows, and numbers that training freezes in clones.
+- *Copies*: Gaussians that share their position, scales, quaternion or the harmonics of degree 1 of a colour
+  with any other one, and values that occur too often.
+- *Nearly equal* scales, or colours of a harmonic: round and grey Gaussians.
+- *Opacities* whose sigmoid is 1, which have no gradient, and those at the edge below which trainers remove
+  Gaussians: no trained model has smaller ones.
+- *Small even numbers*, which an optimiser may have left on a coarser grid: see `trailing_zeros`.
+
+All but the last are found in bits that embedding never changes. docs/threat-model.md tells what each hides.
+
+A *salt* of Argon2id is a hash of one Gaussian and its low bits, which are new random bits for every file and
+carry nothing else: no two files of one cover share a salt. There are several salts because Gaussians may be
+removed. Their order does not change by embedding: Gaussians come late that moved by equal steps away from
+zero or have small even numbers, which are often not usable; else the smallest IDs come first.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from keyss.channels.lsb.bits import (
+    BLOCK,
+    DEEPEST,
+    DEPTHS,
+    GEOMETRY,
+    LEAST,
+    LOW,
+    QUATS,
+    Layout,
+    gaussian_ids,
+    group_words,
+    read_low_bits,
+    used_words,
+)
+from keyss.channels.lsb.equal_steps import Steps, moved_from_zero
+from keyss.channels.lsb.trailing_zeros import count_trailing_zeros, least_exponent
+from keyss.channels.mixing import row_hashes
+from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Numbers, Words, Words32
+from keyss.core.errors import UsageError
+from keyss.core.gaussians import Gaussians
+from keyss.kernels.parallel import in_blocks
+from keyss.keys.derivation import SALT_BYTES
+
+SALTS = 12  # random pruning of a quarter removes all their Gaussians with p = 6e-8
+_LABEL = b"keyss/v3/salt"
+# Maximum squared separation (d') of a plain file and one with new bits by small numbers, for an attacker who
+# knows the trainer and the plain file's statistics. 0.03 is an AUC of 0.55.
+MAX_SEPARATION = 0.03
+
+_GROUPS = {
+    "log scales": slice(0, 3),
+    "quaternions": QUATS,
+    "opacity logits": slice(7, 8),
+    "harmonics": slice(GEOMETRY, None),
+}
+_MAGNITUDE = np.uint32(0x7FFFFFFF)
+_OPACITY = 7
+# Bit patterns of logits above 16. The sigmoid is 1 above 16.64, but only the exponent never changes.
+_SATURATED = np.uint32(0x41800000), np.uint32(0x80000000)
+_PRUNED = np.float32(math.log(0.005 / 0.995)).view(np.uint32) | LOW  # the logit of 0.005, without low bits
+_MIN_USABLE = 0.05  # share of the Gaussians of a cover
+_LARGE_ENOUGH = 118  # biased exponent: optimisers with large last steps leave zeros in numbers below 2^-9
+_SETS_BY_CHANCE = 0.1  # maximum expected number of sets of equal values by chance
+_SAMPLE = 20_000  # Gaussians whose bits are tested
+_LARGE = 10 * _SAMPLE  # Gaussians of a cover whose sample is tested first
+_CHANCE = 1e-6  # probability of refusing a depth of a model with uniform bits
+
+
+@dataclass(frozen=True)
+class Carriers:
+    """The Gaussians of a cover that may be written, by depth."""
+
+    ids: Bytes  # [N, 16] of all Gaussians
+    usable: dict[int, Flags]  # [N] masks by depth, of the depths at which new low bits do not show
+
+    @staticmethod
+    def of(gaussians: Gaussians, layout: Layout, depths: tuple[int, ...] = DEPTHS) -> Carriers:
+        """Raises UsageError, with what shows, if new low bits would show even at the first of `depths`.
+
+        A sample of a large cover is tested first: the whole takes a second for each 40,000 Gaussians.
+        """
+        if len(gaussians) > _LARGE:
+            sample = gaussians[:: len(gaussians) // _SAMPLE]
+            Carriers.of(sample, Layout.of(sample), depths[:1])
+        ids = gaussian_ids(gaussians, layout)
+        steps = Steps(gaussians, layout)
+        fine, usable = _without_copies(gaussians, layout, ids), dict[int, Flags]()
+        for depth in depths:
+            usable[depth] = fine & ~steps.equal(depth)
+            if depth == depths[0]:
+                fine &= _large_enough(gaussians, layout, usable[depth])
+                usable[depth] &= fine
+            if told := _what_tells(gaussians, layout, usable[depth], depth, steps):
+                del usable[depth]
+                if not usable:
+                    raise UsageError(told)
+                break
+        return Carriers(ids, usable)
+
+
+def usable_carriers(gaussians: Gaussians, depth: int = DEEPEST) -> Flags:
+    """Mask [N] of the usable Gaussians at a depth. Raises UsageError as `Carriers.of`."""
+    return Carriers.of(gaussians, Layout.of(gaussians), (depth,)).usable[depth]
+
+
+def _what_tells(gaussians: Gaussians, layout: Layout, usable: Flags, depth: int, steps: Steps) -> str:
+    """What tells new low bits of `usable` [N] Gaussians from the model's own; empty for nothing.
+
+    Tested on at most 20,000 Gaussians: see `chance_of_bits` and `Steps.chance`.
+    """
+    rows = np.flatnonzero(usable)
+    if len(rows) <= _MIN_USABLE * len(usable):
+        return (
+            f"only {len(rows):,} of the cover's {len(usable):,} Gaussians have random low bits; the others "
+            "hold short, repeated or predictable values: it was quantised or hardly trained, and new bits "
+            "would be seen"
+        )
+    used = used_words(gaussians[torch.from_numpy(rows[:: max(1, len(rows) // _SAMPLE)])])
+    for name, group in _GROUPS.items():
+        written = used[:, np.intersect1d(np.arange(used.shape[1])[group], layout.columns)]
+        if written.size and (chance := chance_of_bits(written, depth + 1)) < _CHANCE:
+            return (
+                f"the low bits of {name} in this cover are not random (p = {chance:.0e}), and new ones "
+                "would be seen: the cover was quantised, scaled or moved after its training"
+            )
+    if (chance := steps.chance(depth, usable)) < _CHANCE:
+        return (
+            f"numbers of this cover tell each other's low bits (p = {chance:.0e}), because they moved by "
+            "equal steps, and new ones would be seen: it was hardly trained, or seen from one direction"
+        )
+    return ""
+
+
+def chance_of_bits(words: Words32, bits: int) -> float:
+    """p-value of bits 1 to `bits` - 1 of words [...] under the null hypothesis of uniform bits.
+
+    Exact binomial tests of each bit given exponent, last bit and the bit below, Bonferroni-corrected.
+    """
+    from scipy.special import bdtr  # takes long to load
+
+    flat = words.ravel()
+    context = _exponents(flat).astype(np.int64) << 2 | (flat & 1).astype(np.int64) << 1
+    chances: list[Doubles] = []
+    for bit in range(1, bits):
+        below = (flat >> np.uint32(bit - 1) & 1).astype(np.int64) if bit > 1 else 0
+        times = np.bincount(context | below, minlength=1024)
+        ones = np.bincount((context | below)[(flat >> np.uint32(bit) & 1) == 1], minlength=1024)
+        ones, times = ones[times > 0], times[times > 0]
+        smaller = np.minimum(ones, times - ones)
+        chances.append(np.minimum(1, 2 * bdtr(smaller.astype(np.float64), times, 0.5)))
+    every = np.concatenate(chances)
+    return min(1.0, float(every.min() * len(every)))
+
+
+def salt_rows(gaussians: Gaussians, ids: Bytes, layout: Layout) -> Integers:
+    """Rows of the salts' Gaussians, at most SALTS, in the order of the salts; `ids` [N, 16]."""
+    late = np.where(moved_from_zero(gaussians, layout), np.uint64(255), _smallness(gaussians, layout))
+    keys = late << np.uint64(56) | ids[:, :8].copy().view(">u8")[:, 0].astype(np.uint64) >> np.uint64(8)
+    best = np.argpartition(keys, SALTS - 1)[:SALTS] if len(keys) > SALTS else np.arange(len(keys))
+    low = read_low_bits(gaussians[torch.from_numpy(best)], LEAST, layout)
+    order = sorted(range(len(best)), key=lambda i: (late[best[i]], ids[best[i]].tobytes(), low[i].tobytes()))
+    return best[order]
+
+
+def _smallness(gaussians: Gaussians, layout: Layout) -> Words:
+    """[N] octaves by which the smallest even number lies below _LARGE_ENOUGH; 0 for larger ones."""
+
+    def work(start: int, stop: int) -> Words:
+        used = used_words(gaussians[start:stop])[:, layout.columns]
+        below = np.where(used & 1 == 0, _LARGE_ENOUGH - _exponents(used).astype(np.int64), 0)
+        smallness: Words = below.max(axis=1, initial=0).astype(np.uint64)
+        return smallness
+
+    return np.concatenate([np.zeros(0, np.uint64), *in_blocks(work, len(gaussians), BLOCK)])
+
+
+def salt(carrier_id: Bytes, low: Bytes) -> bytes:
+    """The salt of one carrier: SALT_BYTES."""
+    return hashlib.sha256(_LABEL + carrier_id.tobytes() + low.tobytes()).digest()[:SALT_BYTES]
+
+
+def frequent(words: Numbers, times: int) -> Numbers:
+    """[V] values that occur at least `times` times among `words` [...], in ascending order."""
+    ordered, further = np.sort(words, axis=None), times - 1
+    return np.unique(ordered[further:][ordered[further:] == ordered[: max(0, len(ordered) - further)]])
+
+
+def repeated(values: Words) -> Flags:
+    """Mask [N] of the values [N] that occur at least twice."""
+    return among(values, frequent(values, 2))
+
+
+def among(values: Numbers, ordered: Numbers) -> Flags:
+    """Mask [...] of the values [...] that are in `ordered`, in ascending order; faster than `np.isin`."""
+    if not len(ordered):
+        return np.zeros(values.shape, bool)
+    result: Flags = ordered[np.searchsorted(ordered, values).clip(max=len(ordered) - 1)] == values
+    return result
+
+
+def _exponents(words: Words32) -> Bytes:
+    """[...] the biased binary exponents."""
+    return (words >> np.uint32(23) & np.uint32(255)).astype(np.uint8)
+
+
+def _without_copies(gaussians: Gaussians, layout: Layout, ids: Bytes) -> Flags:
+    """Mask [N] of Gaussians without shared, frequent, nearly equal, saturated and nearly pruned numbers."""
+    shared = [slice(0, 3), *([QUATS] if layout.quats else [])]
+    if layout.sh_degree:
+        shared += [slice(GEOMETRY + colour, GEOMETRY + 9, 3) for colour in range(3)]
+    keys = np.empty((len(shared) + 1, len(gaussians)), np.uint64)
+    keys[-1] = ids.view("<u8")[:, 0]
+    common = [frequent(words, _unlikely_copies(words.size)) for words in group_words(gaussians)]
+    fine = np.empty(len(gaussians), bool)
+
+    def judge(start: int, stop: int) -> None:
+        used = used_words(gaussians[start:stop])
+        for key, columns in zip(keys, shared, strict=False):
+            key[start:stop] = row_hashes(used[:, columns] & ~LOW)
+        large, opacity = _exponents(used), used[:, _OPACITY]
+        good = (large > 0) & (large < 254)
+        good[:, _OPACITY] &= ~((opacity >= _SATURATED[0]) & (opacity < _SATURATED[1]))
+        good[:, _OPACITY] &= opacity | LOW != _PRUNED
+        for group, values in zip(_GROUPS.values(), common, strict=True):
+            good[:, group] &= ~among(used[:, group], values)
+        high = ((used & _MAGNITUDE) >> np.uint32(DEEPEST + 1)).astype(np.int32)
+        triples = np.concatenate([high[:, :3], high[:, GEOMETRY:]], axis=1).reshape(len(used), -1, 3)
+        near = np.abs(triples - triples[:, :, [1, 2, 0]]) <= 1
+        fine[start:stop] = good[:, layout.columns].all(axis=1) & ~near.any(axis=(1, 2))
+
+    in_blocks(judge, len(gaussians), BLOCK)
+    unique: Flags = ~np.logical_or.reduce(in_blocks(lambda index, _: repeated(keys[index]), len(keys), 1))
+    return fine & unique
+
+
+def _large_enough(gaussians: Gaussians, layout: Layout, counted: Flags) -> Flags:
+    """Mask [N] of Gaussians without small even numbers, by the trailing zeros of those `counted` [N]."""
+
+    def count(start: int, stop: int) -> Integers:
+        used = used_words(gaussians[start:stop])
+        own = counted[start:stop]
+        return np.stack([count_trailing_zeros(used[:, group], own) for group in _GROUPS.values()])
+
+    large = np.ones(len(gaussians), bool)
+    counts = np.sum(in_blocks(count, len(gaussians), BLOCK), axis=0)
+    least = [least_exponent(each, MAX_SEPARATION / len(_GROUPS)) for each in counts]
+
+    def compare(start: int, stop: int) -> None:
+        used = used_words(gaussians[start:stop])
+        for group, bound in zip(_GROUPS.values(), least, strict=True):
+            if layout.quats or group != QUATS:
+                values = used[:, group]
+                large[start:stop] &= ~((_exponents(values) < bound) & (values & 1 == 0)).any(axis=1)
+
+    in_blocks(compare, len(gaussians), BLOCK)
+    return large
+
+
+def _unlikely_copies(count: int) -> int:
+    """The least c >= 3 for which c equal values are rare among `count` values.
+
+    With 2^26 equally likely values, count^c / c! / 2^(26 (c - 1)) such sets are expected.
+    """
+    copies = 3
+    while count**copies / math.factorial(copies) > _SETS_BY_CHANCE * 2 ** (26 * (copies - 1)):
+        copies += 1
+    return copies

@@ -1,0 +1,442 @@
+"""Payloads in low bits: what they survive, who can read them, what can be seen, and copies of a file."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import gsply
+import numpy as np
+import plyfile
+import pytest
+import torch
+from argon2.low_level import Type, hash_secret_raw
+
+from channels.lsb.payloads import embed, embed_derived, extract, extract_derived
+from channels.lsb.trained_like import UNNATURAL, keys, trained_like
+from keyss.channels import (
+    LOW_BITS,
+    Layout,
+    LowBitsCapacity,
+    LsbReader,
+    base,
+    check_payload_fits,
+    gaussian_ids,
+    read_low_bits,
+    salt_rows,
+    usable_carriers,
+    write_low_bits,
+)
+from keyss.channels.lsb import spread
+from keyss.channels.mixing import bloom_filter, foreign_share
+from keyss.core import Gaussians, InputError, KeyssWarning, UsageError, WrongKeyError
+from keyss.files import read_model, write_model
+from keyss.keys import ALPHABET, DerivedKey, generate_key
+from keyss.rendering import render
+from tiny_scenes import ring_cameras
+
+PAYLOAD = bytes(range(256)) * 4 + os.urandom(2999) + b"."
+KEY = "the right key"
+GENERATED = "q7Rv2LxT9bWm4KzD"
+SMALLEST = 700  # Gaussians that carry a byte
+
+
+@pytest.fixture(scope="module")
+def plain() -> Gaussians:
+    return trained_like(1500)
+
+
+@pytest.fixture(scope="module")
+def stego(plain: Gaussians) -> Gaussians:
+    return embed(plain, [(KEY, PAYLOAD)])
+
+
+def test_a_model_of_equal_gaussians_holds_nothing(plain: Gaussians) -> None:
+    with pytest.raises(WrongKeyError):
+        extract(plain[torch.zeros(200, dtype=torch.int64)], KEY)
+
+
+@pytest.mark.parametrize("unit", [False, True])
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_round_trip_of_lower_degrees(degree: int, unit: bool) -> None:
+    """Without quaternions at degree 0, rows have no tag."""
+    model = trained_like(6000, sh_degree=degree)
+    if unit:
+        model = replace(model, quats=torch.nn.functional.normalize(model.quats))
+    own = keys()
+    stego = embed_derived(model, [(own, PAYLOAD[:1500])])
+    assert extract_derived(stego, own[0]) == PAYLOAD[:1500]
+    order = torch.randperm(6000, generator=torch.Generator().manual_seed(degree))[:4500]
+    pruned = LsbReader.of(stego[order])
+    first = LsbReader.of(stego).salts.index(pruned.salts[0])
+    assert extract_derived(pruned, own[first]) == PAYLOAD[:1500]
+
+
+def test_the_same_entropy_gives_the_same_bits_and_other_payloads_others(plain: Gaussians) -> None:
+    own, entropy = keys(), bytes(32)
+    stego = embed_derived(plain, [(own, PAYLOAD)], entropy)
+    assert embed_derived(plain, [(own, PAYLOAD)], entropy).digest() == stego.digest()
+    for other in (  # the salts are others, and so are the derived keys
+        embed_derived(plain, [(keys(1), PAYLOAD[:-1] + b"!")], entropy),
+        embed_derived(plain, [(keys(2), PAYLOAD)]),
+    ):
+        same = (read_low_bits(other, 4) == read_low_bits(stego, 4))[usable_carriers(plain, 4)].mean()
+        assert same == pytest.approx(1 / 256, abs=2e-3)  # as between independent random bytes
+
+
+def test_the_same_entropy_in_another_cover_repeats_nothing(plain: Gaussians) -> None:
+    """Otherwise equal noise would tell the carriers of data from the others."""
+    seen = []
+    for cover in (plain, trained_like(1500, 77)):
+        low = read_low_bits(embed(cover, [(KEY, PAYLOAD)], bytes(32)), 4)
+        seen.append({row.tobytes() for row in low[usable_carriers(cover, 4)]})
+    assert not seen[0] & seen[1]
+
+
+def test_only_low_bits_of_some_fields_change(plain: Gaussians, stego: Gaussians) -> None:
+    assert torch.equal(plain.means, stego.means)
+    assert torch.equal(plain.sh[:, 0], stego.sh[:, 0])
+    for name, bits in (("log_scales", 5), ("quats", 5), ("opacity_logits", 5), ("sh", 5)):
+        before, after = (getattr(model, name).contiguous().view(torch.int32) for model in (plain, stego))
+        assert not torch.equal(before, after)
+        assert torch.equal(before >> bits, after >> bits), name
+        assert torch.equal(before & 1, after & 1), name
+    assert np.array_equal(gaussian_ids(plain), gaussian_ids(stego))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_survives_shuffling_and_the_loss_of_a_quarter(stego: Gaussians, seed: int) -> None:
+    order = torch.randperm(len(stego), generator=torch.Generator().manual_seed(seed))
+    own = keys()
+    again = embed_derived(stego, [(own, PAYLOAD)])
+    kept = again[order[: len(stego) * 3 // 4]]
+    salt = LsbReader.of(again).salts.index(LsbReader.of(kept).salts[0])
+    assert extract_derived(kept, own[salt]) == PAYLOAD
+    if seed == 0:
+        assert extract(stego[order[: len(stego) * 3 // 4]], KEY) == PAYLOAD
+
+
+def test_too_much_pruning_is_said_to_the_holder_of_the_key_only() -> None:
+    model = trained_like(4000)
+    own, other = keys(), keys(1)
+    capacity = LOW_BITS.prepare(model).capacity.bytes
+    stego = embed_derived(model, [(own, os.urandom(capacity * 9 // 10))])
+    order = torch.randperm(4000, generator=torch.Generator().manual_seed(0))
+    first = salt_rows(stego, gaussian_ids(stego), Layout.of(stego))[:1]
+    rest = stego[torch.cat([torch.from_numpy(first), order[:1500]])]
+    with pytest.raises(InputError, match="too much of the model"):
+        extract_derived(rest, own[0])
+    with pytest.raises(WrongKeyError):
+        extract_derived(rest, other[0])
+
+
+def _resave_by_plyfile(source: Path, target: Path) -> None:
+    data = plyfile.PlyData.read(source)
+    plyfile.PlyData([plyfile.PlyElement.describe(data["vertex"].data.copy(), "vertex")]).write(target)
+
+
+RESAVERS: dict[str, Callable[[Path, Path], object]] = {
+    "keyss": lambda source, target: write_model(target, read_model(source)),
+    "gsply": lambda source, target: gsply.plywrite(target, gsply.plyread(source)),
+    "plyfile": _resave_by_plyfile,
+}
+
+
+@pytest.mark.parametrize("name", RESAVERS)
+def test_survives_being_saved_again(stego: Gaussians, tmp_path: Path, name: str) -> None:
+    write_model(tmp_path / "in.ply", stego)
+    RESAVERS[name](tmp_path / "in.ply", tmp_path / "out.ply")
+    assert extract(read_model(tmp_path / "out.ply"), KEY) == PAYLOAD
+
+
+def test_survives_splat_transform(
+    splat_transform: Callable[..., Path], stego: Gaussians, tmp_path: Path
+) -> None:
+    write_model(tmp_path / "in.ply", stego)
+    copy = splat_transform(tmp_path / "in.ply", tmp_path / "out.ply")
+    assert extract(read_model(copy), KEY) == PAYLOAD
+
+
+def test_two_secrets_open_with_their_own_keys_only(plain: Gaussians) -> None:
+    model, first, second = trained_like(4500, seed=5), keys(1), keys(2)
+    stego = embed_derived(model, [(first, b"first"), (second, PAYLOAD)])
+    assert extract_derived(stego, first[0]) == b"first"
+    assert extract_derived(stego, second[0]) == PAYLOAD
+    with pytest.raises(WrongKeyError):
+        extract_derived(stego, keys(3)[0])
+    with pytest.raises(UsageError, match="same key"):
+        embed_derived(model, [(first, b"a"), (first, b"b")])
+
+
+def _neighbours(key: str) -> list[str]:
+    """`key` with one character changed to any other of the alphabet, or its cases exchanged."""
+    changed = {key[:i] + c + key[i + 1 :] for i in range(len(key)) for c in ALPHABET}
+    return sorted((changed | {key.swapcase(), key.upper(), key.lower()}) - {key})
+
+
+def test_a_thousand_random_keys_open_nothing() -> None:
+    """Below Argon2id, whose output is replaced: it is what keys differ in."""
+    model, own = trained_like(SMALLEST, seed=3), keys()
+    stego = embed_derived(model, [(own, b"x")])
+    reader = LsbReader.of(stego)
+    assert extract_derived(reader, own[0]) == b"x"
+    for number in range(1000):
+        with pytest.raises(WrongKeyError):
+            extract_derived(reader, DerivedKey(number.to_bytes(32, "big")))
+
+
+def test_keys_of_one_other_character(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sample, with an Argon2id of 64 KiB and one pass; `test_wrong_keys_at_full_cost` tries all."""
+
+    def cheap(secret: bytes, salt: bytes, **costs: object) -> bytes:
+        return hash_secret_raw(secret, salt, 1, 64, 1, 32, Type.ID)
+
+    monkeypatch.setattr("keyss.keys.derivation.hash_secret_raw", cheap)
+    stego = embed(trained_like(SMALLEST, seed=3), [(GENERATED, b"x")])
+    assert extract(stego, GENERATED) == b"x"
+    neighbours = _neighbours(GENERATED)
+    assert len(neighbours) == 16 * 61 + 3
+    for neighbour in neighbours[::8]:
+        with pytest.raises(WrongKeyError):
+            extract(stego, neighbour)
+
+
+@pytest.mark.slow
+def test_wrong_keys_at_full_cost() -> None:
+    """1,000 random keys and all one-character neighbours, as a person would try them; 3 to 10 minutes."""
+    stego = embed(trained_like(SMALLEST, seed=3), [(GENERATED, b"x")])
+    assert extract(stego, GENERATED) == b"x"
+    for wrong in [*_neighbours(GENERATED), *(generate_key() for _ in range(1000))]:
+        with pytest.raises(WrongKeyError):
+            extract(stego, wrong)
+
+
+def test_a_wrong_key_makes_the_same_work_as_a_right_one(
+    stego: Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Up to the decryption of the payload: nearly as many blocks of AES; those of its shards are few."""
+    blocks = 0
+    real = spread.encrypted_blocks
+
+    def counted(key: bytes, data: np.ndarray) -> np.ndarray:
+        nonlocal blocks
+        blocks += data.size // 16
+        return real(key, data)
+
+    monkeypatch.setattr(spread, "encrypted_blocks", counted)
+    reader = LsbReader.of(stego)
+    assert extract_derived(reader, DerivedKey.of(KEY, reader.salts[0])) == PAYLOAD
+    needed, blocks = blocks, 0
+    with pytest.raises(WrongKeyError):
+        reader.extract(DerivedKey.of("The right key", reader.salts[0]))
+    assert 0.5 * needed < blocks <= needed
+
+
+def test_a_wrong_key_is_tried_under_a_few_salts(stego: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
+    derived = []
+    monkeypatch.setattr(DerivedKey, "of", lambda key, salt: derived.append(key) or keys(5)[0])
+    with pytest.raises(WrongKeyError):
+        extract(stego, "The right key")
+    assert len(derived) == base.SALTS_TRIED
+
+
+def test_ordinary_models_open_for_nobody_and_look_the_same(plain: Gaussians) -> None:
+    with pytest.raises(WrongKeyError):
+        extract(plain, KEY)
+    with pytest.raises(WrongKeyError):
+        extract(trained_like(50, sh_degree=0), KEY)
+
+
+def test_models_too_small_are_refused_with_the_number_that_would_do() -> None:
+    with pytest.raises(UsageError, match=r"too small.*Gaussians would do"):
+        embed_derived(trained_like(330), [(keys(), PAYLOAD)])
+    with pytest.raises(UsageError, match="too small"):
+        check_payload_fits(30_000, 10_000, 1, sh_degree=0)
+    with pytest.raises(UsageError, match="for each of 2 secrets"):
+        check_payload_fits(126_000, 5_000, 2, sh_degree=3)
+    check_payload_fits(126_000, 10_000, 1, sh_degree=3)
+
+
+def test_capacity_grows_with_the_model_and_is_kept_to() -> None:
+    gaussians = (130, 700, 2000, 8000, 26_000, 260_000)
+    capacities = [LowBitsCapacity.of(count, Layout(3)) for count in gaussians]
+    sizes = [each.for_payloads().bytes for each in capacities]
+    assert sizes == sorted(sizes)
+    assert sizes[0] == 0
+    assert sizes[-1] / gaussians[-1] > 24  # a model at the finest precision
+    assert capacities[-1].payload_capacity(1) > 1.9 * capacities[-1].payload_capacity(2)
+    for capacity, size in zip(capacities[1:], sizes[1:], strict=True):
+        for secrets in (1, 2, 4) if capacity.gaussians >= 8000 else (1,):
+            plan = capacity.plan([size // 8 // secrets] * secrets)
+            assert plan.independent == (capacity.gaussians >= 8000)
+            assert plan.depth == 4
+            taken = sum(share.carriers for share in plan.shares) + secrets * capacity.header_carriers
+            assert taken <= capacity.carriers[plan.depth]
+        largest = capacity.payload_capacity(1)
+        assert size <= largest < 1.5 * size
+        assert capacity.plan([largest]).depth == 8
+        with pytest.raises(UsageError, match="too small"):
+            capacity.plan([largest + 1])
+
+
+def test_a_secret_gets_the_least_share_that_holds_it() -> None:
+    capacity = LowBitsCapacity.of(20_000, Layout(3))
+    steps = capacity.for_payloads().steps
+    assert [part for part, _ in steps] == [0.25, 0.5, 1, 1, 1]
+    sizes = [size for _, size in steps]
+    assert sizes == sorted(sizes)
+    plans = [capacity.plan([size]) for size in sizes]
+    assert [plan.depth for plan in plans] == [4, 4, 4, 6, 8]
+    carriers = [plan.shares[0].carriers for plan in plans]
+    assert carriers[0] < carriers[1] < carriers[2] == carriers[3] == carriers[4]
+    assert not capacity.plan([sizes[2], sizes[0]]).independent
+
+
+def test_more_than_the_places_of_header_and_shards_never_decides() -> None:
+    """At the largest size of each share, with a quarter of the Gaussians lost at random."""
+    model, own = trained_like(6000, 21), keys()
+    prepared = LOW_BITS.prepare(model)
+    for index, (_, size) in enumerate(prepared.capacity.steps):
+        data = os.urandom(size - prepared.capacity.overhead)
+        stego = embed_derived(model, [(own, data)])
+        order = torch.randperm(6000, generator=torch.Generator().manual_seed(index))[:4500]
+        reader = LsbReader.of(stego[order])
+        known = LsbReader.of(stego).salts.index(reader.salts[0])
+        assert extract_derived(reader, own[known]) == data
+
+
+@pytest.mark.parametrize("change", UNNATURAL)
+def test_models_without_random_low_bits_are_refused(
+    change: Callable[[Gaussians], Gaussians], plain: Gaussians
+) -> None:
+    with pytest.raises(UsageError, match="low bits"):
+        embed_derived(change(plain), [(keys(), b"x")])
+
+
+def test_values_that_are_not_random_stay_as_they_are() -> None:
+    model = trained_like(1500, seed=8)
+    model.quats[:100] = torch.tensor([1.0, 0, 0, 0])
+    model.sh[100:200, 4:] = 0
+    model.opacity_logits[200:230] = 0.1234567
+    twice = Gaussians.cat([model, model[300:310]])
+    usable = usable_carriers(twice)
+    assert not usable[:230].any()
+    assert not usable[300:310].any()
+    assert not usable[-10:].any()
+    assert usable[310:1500].mean() > 0.95
+    stego = embed_derived(twice, [(keys(), b"x")])
+    assert stego[torch.from_numpy(~usable)].digest() == twice[torch.from_numpy(~usable)].digest()
+
+
+def test_values_that_are_nearly_equal_stay_as_they_are() -> None:
+    """Grey colours and round Gaussians, whichever low bits their values have."""
+    model = trained_like(3000, seed=8)
+    grey, round_ = slice(0, 300), slice(300, 600)
+    model.sh[grey, 7, 2] = model.sh[grey, 7, 0] * (1 + 1e-5)
+    model.log_scales[round_, 1] = model.log_scales[round_, 2] * (1 - 1e-6)
+    usable = usable_carriers(model)
+    assert not usable[:600].any()
+    assert usable[600:].mean() > 0.95
+    stego = embed_derived(model, [(keys(), b"x")])
+    assert np.array_equal(usable_carriers(stego)[:600], usable[:600])
+    assert model[:600].digest() == stego[:600].digest()
+
+
+def test_renders_before_and_after_are_equal_beyond_what_can_be_seen() -> None:
+    model = trained_like(1500, seed=9)
+    log_scales = (0.7371 * model.log_scales.double()).float()
+    model = replace(model, means=model.means / 4, log_scales=log_scales, sh=model.sh * 2)
+    stego = embed_derived(model, [(keys(), PAYLOAD)])
+    for camera in ring_cameras(4):
+        error = (render(model, camera) - render(stego, camera)).square().mean()
+        assert -10 * torch.log10(error) > 70
+
+
+@pytest.fixture(scope="module")
+def cover() -> Gaussians:
+    return trained_like(1500, 4)
+
+
+def test_two_hidings_in_one_cover_have_no_salt_in_common(cover: Gaussians) -> None:
+    first, second = (LsbReader.of(embed(cover, [(KEY, b"x")])).salts for _ in range(2))
+    assert len(set(first)) == len(set(second)) == 12
+    assert not set(first) & set(second)
+
+
+def test_copies_count_once(cover: Gaussians) -> None:
+    stego = embed(cover, [(KEY, PAYLOAD)])
+    five = Gaussians.cat([stego] * 5)[torch.randperm(5 * len(stego))]
+    one, other = (LsbReader.of(model).open(KEY) for model in (stego, five))
+    assert one == other
+    assert one.shards == other.shards
+    assert other.foreign == 0
+
+
+@pytest.mark.parametrize(("times", "degree", "unit"), [(3, 3, False), (8, 3, False), (3, 0, True)])
+def test_what_a_file_hides_is_found_among_others_by_a_salt_of_its_own(
+    times: int, degree: int, unit: bool
+) -> None:
+    """Other Gaussians displace places of the header, and false shards join the true ones."""
+    model, others = (trained_like(count, 9, degree) for count in (6000, 6000 * times))
+    if unit:
+        model, others = (
+            replace(each, quats=torch.nn.functional.normalize(each.quats)) for each in (model, others)
+        )
+    own = keys()
+    both = Gaussians.cat([others, embed_derived(model, [(own, PAYLOAD[:1000])])])
+    assert extract_derived(both, own[0]) == PAYLOAD[:1000]
+
+
+def test_who_merges_two_files_under_one_key_is_told(cover: Gaussians) -> None:
+    first, second = embed(cover, [(KEY, b"first")]), embed(trained_like(1500, 9), [(KEY, b"second")])
+    with pytest.warns(KeyssWarning, match=r"about [\d,]+ Gaussians were added"):
+        assert extract(Gaussians.cat([first, second]), KEY) in (b"first", b"second")
+
+
+def replaced(first: Gaussians, second: Gaussians, kept: float) -> Gaussians:
+    """What somebody without keys makes of two files, so that the key of both opens the first one's secret.
+
+    The salts of the second are overwritten, and the first loses Gaussians that give no salt.
+    """
+    rows = salt_rows(second, gaussian_ids(second), Layout.of(second))
+    low = np.random.default_rng(0).integers(0, 256, (len(rows), 53), np.uint8)
+    second = write_low_bits(second, Layout.of(second), [(8, rows, low)])
+    salts = salt_rows(first, gaussian_ids(first), Layout.of(first))
+    rest = np.setdiff1d(np.arange(len(first)), salts)[: int(kept * len(first))]
+    return Gaussians.cat([second, first[torch.from_numpy(np.concatenate([salts, rest]))]])
+
+
+@pytest.mark.parametrize("kept", [1.0, 0.8, 0.5])
+def test_who_puts_one_file_into_another_does_not_go_unnoticed(cover: Gaussians, kept: float) -> None:
+    first, second = embed(cover, [(KEY, b"first")]), embed(trained_like(1500, 9), [(KEY, b"second")])
+    with pytest.warns(KeyssWarning, match="Gaussians were added to the file"):
+        assert extract(replaced(first, second, kept), KEY) == b"first"
+
+
+@pytest.mark.parametrize("kept", [slice(None), slice(300, None), slice(None, None, -2)])
+def test_who_removes_gaussians_is_not_warned(cover: Gaussians, kept: slice) -> None:
+    stego = embed(cover, [(KEY, b"first")])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert extract(stego[torch.arange(len(stego)).numpy()[kept].copy()], KEY) == b"first"
+
+
+@pytest.mark.parametrize("left", [1.0, 0.7])
+def test_fewer_foreign_gaussians_than_a_quarter_are_noticed(cover: Gaussians, left: float) -> None:
+    """A Bloom filter of 256 bits misses so many with probability e^(-256 / 6 e) = 2e-7."""
+    stego = embed(cover, [(KEY, b"first")])
+    more = Gaussians.cat([stego[: int(left * len(stego))], trained_like(len(stego) // 6, 14)])
+    with pytest.warns(KeyssWarning, match=r"about [\d,]+ Gaussians were added"):
+        assert extract(more, KEY) == b"first"
+
+
+def test_bloom_filter_counts_foreign_gaussians() -> None:
+    ids = np.random.default_rng(0).integers(0, 256, (40_000, 16), np.uint8)
+    for count in (1, 100, 20_000):
+        own = bloom_filter(KEY.encode().ljust(16), ids[:count])
+        assert foreign_share(KEY.encode().ljust(16), ids[:count], own, count) == 0
+    assert 0.35 < foreign_share(KEY.encode().ljust(16), ids, own, 20_000) < 0.65
+    assert foreign_share(b"another data key", ids[:20_000], own, 20_000) > 0.8

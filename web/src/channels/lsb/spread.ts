@@ -1,0 +1,109 @@
+/**
+ * What a key finds in the low bits of Gaussians by their IDs alone; counterpart of `keyss.channels.lsb.spread`
+ * (docs/byte-layout.md, "Messages" and "Shards").
+ */
+import { bytesKey, mostFrequent, rowsOf, viewOf } from '../../core/bytes.ts';
+import { encryptBlocks } from '../../keys/aes.ts';
+import { expand } from '../../keys/keys.ts';
+import type { Codewords } from '../reed_solomon.ts';
+
+const ID_BYTES = 16;
+const BLOCK = 16; // bytes of a block of AES
+const CANDIDATES = 8; // Gaussians that are looked at for each place
+const NUMBER_BYTES = 2;
+const LEAST_TAGGED = 5; // bytes of a row from which on it has a tag
+const PER_GROUP = 32; // codewords of a group whose rows have tags
+
+/** [N, size] a pseudo-random function of `ids` [N, 16]. */
+function functionOf(secret: Uint8Array, label: string, ids: Uint8Array, size = BLOCK): Uint8Array {
+  const [key, count, blocks] = [expand(secret, `lsb/${label}`), ids.length / ID_BYTES, Math.ceil(size / BLOCK)];
+  const found = new Uint8Array(count * size);
+  for (let block = 0; block < blocks; block++) {
+    const counted = ids.slice();
+    for (let row = 0; row < count; row++) counted[(row + 1) * BLOCK - 1] ^= block;
+    const [values, end] = [encryptBlocks(key, counted), Math.min(BLOCK, size - block * BLOCK)];
+    for (let row = 0; row < count; row++) found.set(values.subarray(row * BLOCK, row * BLOCK + end), row * size + block * BLOCK);
+  }
+  return found;
+}
+
+/** Low bits of Gaussians: rows of `width` bytes. */
+export interface Table {
+  readonly ids: Uint8Array; // [N, 16]
+  readonly low: Uint8Array; // [N, width]
+  readonly width: number;
+}
+
+/** The message of `size` bytes under a secret, in fragments of `width` bytes in `copies` places: the most frequent contents. */
+export function message(
+  secret: Uint8Array, label: string, size: number, width: number, copies: number, table: Table,
+): Uint8Array {
+  const found = new Uint8Array(Math.ceil(size / width) * width);
+  const candidates = candidatesOf(functionOf(secret, `${label}/place`, table.ids), found.length / width, copies);
+  candidates.forEach((rows, fragment) => {
+    const pads = functionOf(secret, `${label}/pad`, rowsOf(table.ids, rows, ID_BYTES), width);
+    const contents = rows.map((row, at) => {
+      return bytesKey(pads.subarray(at * width, (at + 1) * width).map((each, byte) => each ^ table.low[row * table.width + byte]));
+    });
+    // Of equally frequent ones the smallest.
+    const [best] = mostFrequent(contents.sort()) ?? [''];
+    for (let byte = 0; byte < best.length; byte++) found[fragment * width + byte] = best.charCodeAt(byte);
+  });
+  return found.subarray(0, size);
+}
+
+/** The rows that are looked at for each fragment: those with the smallest function `values` [N, 16]. */
+function candidatesOf(values: Uint8Array, fragments: number, copies: number): number[][] {
+  const [view, count] = [viewOf(values), values.length / BLOCK];
+  const order = Float64Array.from({ length: count }, (_, row) => view.getUint32(row * BLOCK));
+  const among = Math.min(count, CANDIDATES * copies * fragments);
+  const bound = among < count ? order.slice().sort()[among - 1] : Infinity;
+  const near: number[] = [];
+  for (let row = 0; row < count; row++) if (order[row] <= bound) near.push(row);
+  const lower = (row: number): number => view.getUint32(row * BLOCK + 4);
+  near.sort((a, b) => order[a] - order[b] || lower(a) - lower(b));
+  const candidates = Array.from({ length: fragments }, () => [] as number[]);
+  for (const row of near.slice(0, among)) {
+    candidates[view.getUint32(row * BLOCK + 8, true) % fragments].push(row);
+  }
+  return candidates;
+}
+
+/** The numbers and data of all shards of a payload that are left in `table`, and false ones. */
+export function shardsOf(dataKey: Uint8Array, codewords: Codewords, tagged: boolean, table: Table): [number, Uint8Array][] {
+  const { ids, low, width } = table;
+  const values = functionOf(dataKey, 'shard/place', ids);
+  const [view, groups] = [viewOf(values), Math.max(1, Math.floor(codewords.count / (tagged ? PER_GROUP : 1)))];
+  const [ofGroup, start] = [codewords.count / groups, (tagged ? 1 : 0) + NUMBER_BYTES];
+  const [rows, numbers] = [[] as number[], [] as number[]];
+  for (let row = 0; row < ids.length / ID_BYTES; row++) {
+    const [at, cell] = [row * BLOCK, row * width];
+    if (tagged && low[cell] !== values[at]) continue;
+    const local = (low[cell + start - 2] | (low[cell + start - 1] << 8)) ^ view.getUint16(at + 2, true);
+    if (local >= codewords.n * ofGroup) continue;
+    const group = view.getUint32(at + 4, true) % groups;
+    rows.push(row);
+    numbers.push(Math.floor(local / ofGroup) * codewords.count + group * ofGroup + (local % ofGroup));
+  }
+  const size = codewords.width;
+  const data = functionOf(dataKey, 'shard/pad', rowsOf(ids, rows, ID_BYTES), size);
+  rows.forEach((row, at) => {
+    for (let byte = 0; byte < size; byte++) data[at * size + byte] ^= low[row * width + start + byte];
+  });
+  return numbers.map((number, at) => [number, data.subarray(at * size, (at + 1) * size)]);
+}
+
+/** True if rows of `width` bytes have a tag. */
+export function isTagged(width: number): boolean {
+  return width >= LEAST_TAGGED;
+}
+
+/** Bytes of a shard in a row of `width` bytes. */
+export function shardBytes(width: number): number {
+  return Math.max(0, 2 * Math.floor((width - NUMBER_BYTES - (isTagged(width) ? 1 : 0)) / 2));
+}
+
+/** True if so many codewords can be divided into equal groups. */
+export function isWhole(codewords: number, tagged: boolean): boolean {
+  return !tagged || codewords <= PER_GROUP || codewords % PER_GROUP === 0;
+}
