@@ -89,8 +89,8 @@ def hide(
     for a file that must not change: secrets go unnoticed in low bits of a "ply", or in the integers of an
     "spz", "sog" or "compressed-ply", or of a model decoded from one. By default `format` is the cover's; if
     nothing can be hidden in it unnoticed, `publish` becomes "converted", with a warning. Such files may be
-    converted: secrets are in the channel "appended" (more Gaussians, which are visible in the file) or "colours" (less
-    capacity). `width`, `background`, `skip_missing`: see `load_scene`.
+    converted: secrets are in the channel "appended" (more Gaussians, which are visible in the file) or
+    "colours" (less capacity). `width`, `background`, `skip_missing`: see `load_scene`.
 
     `out` (a folder) gets `publish/` with the stego model, and `private/` with fitted models, `config.json`,
     `metrics.json`, `look.png` (test views of cover and secrets before and after), companion files for methods
