@@ -14,10 +14,9 @@ import pytest
 import torch
 from hypothesis import given, settings, strategies as st
 
-from keyss.channels import APPENDED, AppendedReader, Payload
+from keyss.channels import APPENDED, AppendedReader, Payload, pack_payload
 from keyss.channels.appended import pilots
 from keyss.channels.appended.words import WORD_BITS, to_gaussians
-from keyss.channels.base import pack_payload
 from keyss.core import (
     DRAWN_OPACITY,
     Gaussians,

@@ -287,14 +287,14 @@ def test_false_acceptance_is_rarer_than_two_to_the_minus_64(monkeypatch: pytest.
     payload there can be, and as often as a reader tries to decrypt.
     """
     stego = embed(cover(6000), [("a", b"x")], entropy=bytes(32))
-    sizes, decrypt = [], channel.decrypt
+    sizes, unseal = [], channel.unseal
 
-    def counted(data_key: bytes, encrypted: bytes, associated: bytes) -> bytes:
-        sizes.append(len(encrypted))
-        decrypt(data_key, encrypted, associated) if len(sizes) == 1 else None
+    def counted(data_key: bytes, sealed: bytes) -> bytes:
+        sizes.append(len(sealed))
+        unseal(data_key, sealed) if len(sizes) == 1 else None
         raise InputError("so that all is tried that ever is")
 
-    monkeypatch.setattr(channel, "decrypt", counted)
+    monkeypatch.setattr(channel, "unseal", counted)
     for name in "ab":
         with pytest.raises(Exception, match="the key is right" if name == "a" else "opens nothing"):
             extract(stego, name)

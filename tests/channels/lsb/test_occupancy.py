@@ -11,9 +11,10 @@ import pytest
 from scipy.stats import ks_2samp
 
 from channels.lsb.trained_like import keys
-from keyss.channels import LEAST, Layout, LowBitsCapacity, Payload
-from keyss.channels.lsb.lsb_header import Parameters, key_message, key_secret, parameter_message
-from keyss.channels.lsb.payloads import Writer
+from keyss.channels import LEAST, Layout, LowBitsCapacity, Parameters, Payload, Shards
+from keyss.channels.container import key_secret
+from keyss.channels.lsb.low_bits import Writer
+from keyss.channels.lsb.low_bits_capacity import codewords_of, key_message, parameter_message
 from keyss.channels.lsb.usable import SALTS
 from keyss.core import KeyssWarning
 
@@ -40,9 +41,9 @@ def _seen(sizes: Sequence[int]) -> list[float]:
     message = parameter_message(data_key, low.shape[1])
     packed = message.read(IDS, low)
     places, contents = message.write(IDS, packed)
-    own_parameters = (low[places] == contents).all(axis=1)
-    found = Parameters.unpack(packed, data_key, LAYOUT)
-    own = found.shards(data_key, LAYOUT).decrypt(IDS, low)[0]
+    own_parameters = (low[places, : contents.shape[1]] == contents).all(axis=1)
+    found = Parameters.unpack(packed, data_key)
+    own = Shards(data_key, codewords_of(found, LAYOUT), True).decrypt(IDS, low)[0]
     return [
         float(own_key.sum()),
         float(own_parameters.sum()),

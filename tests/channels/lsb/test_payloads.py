@@ -21,8 +21,7 @@ from keyss.channels import (
     LOW_BITS,
     Layout,
     LowBitsCapacity,
-    LsbReader,
-    base,
+    LowBitsReader,
     check_payload_fits,
     gaussian_ids,
     read_low_bits,
@@ -30,8 +29,9 @@ from keyss.channels import (
     usable_carriers,
     write_low_bits,
 )
+from keyss.channels.container import SALTS_TRIED
+from keyss.channels.foreign import exact_foreign, exact_record
 from keyss.channels.lsb import spread
-from keyss.channels.mixing import bloom_filter, foreign_share
 from keyss.core import Gaussians, InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.files import read_model, write_model
 from keyss.keys import ALPHABET, DerivedKey, generate_key
@@ -70,8 +70,8 @@ def test_round_trip_of_lower_degrees(degree: int, unit: bool) -> None:
     stego = embed_derived(model, [(own, PAYLOAD[:1500])])
     assert extract_derived(stego, own[0]) == PAYLOAD[:1500]
     order = torch.randperm(6000, generator=torch.Generator().manual_seed(degree))[:4500]
-    pruned = LsbReader.of(stego[order])
-    first = LsbReader.of(stego).salts.index(pruned.salts[0])
+    pruned = LowBitsReader.of(stego[order])
+    first = LowBitsReader.of(stego).salts.index(pruned.salts[0])
     assert extract_derived(pruned, own[first]) == PAYLOAD[:1500]
 
 
@@ -113,7 +113,7 @@ def test_survives_shuffling_and_the_loss_of_a_quarter(stego: Gaussians, seed: in
     own = keys()
     again = embed_derived(stego, [(own, PAYLOAD)])
     kept = again[order[: len(stego) * 3 // 4]]
-    salt = LsbReader.of(again).salts.index(LsbReader.of(kept).salts[0])
+    salt = LowBitsReader.of(again).salts.index(LowBitsReader.of(kept).salts[0])
     assert extract_derived(kept, own[salt]) == PAYLOAD
     if seed == 0:
         assert extract(stego[order[: len(stego) * 3 // 4]], KEY) == PAYLOAD
@@ -181,7 +181,7 @@ def test_a_thousand_random_keys_open_nothing() -> None:
     """Below Argon2id, whose output is replaced: it is what keys differ in."""
     model, own = trained_like(SMALLEST, seed=3), keys()
     stego = embed_derived(model, [(own, b"x")])
-    reader = LsbReader.of(stego)
+    reader = LowBitsReader.of(stego)
     assert extract_derived(reader, own[0]) == b"x"
     for number in range(1000):
         with pytest.raises(WrongKeyError):
@@ -227,7 +227,7 @@ def test_a_wrong_key_makes_the_same_work_as_a_right_one(
         return real(key, data)
 
     monkeypatch.setattr(spread, "encrypted_blocks", counted)
-    reader = LsbReader.of(stego)
+    reader = LowBitsReader.of(stego)
     assert extract_derived(reader, DerivedKey.of(KEY, reader.salts[0])) == PAYLOAD
     needed, blocks = blocks, 0
     with pytest.raises(WrongKeyError):
@@ -240,7 +240,7 @@ def test_a_wrong_key_is_tried_under_a_few_salts(stego: Gaussians, monkeypatch: p
     monkeypatch.setattr(DerivedKey, "of", lambda key, salt: derived.append(key) or keys(5)[0])
     with pytest.raises(WrongKeyError):
         extract(stego, "The right key")
-    assert len(derived) == base.SALTS_TRIED
+    assert len(derived) == SALTS_TRIED
 
 
 def test_ordinary_models_open_for_nobody_and_look_the_same(plain: Gaussians) -> None:
@@ -303,8 +303,8 @@ def test_more_than_the_places_of_header_and_shards_never_decides() -> None:
         data = os.urandom(size - prepared.capacity.overhead)
         stego = embed_derived(model, [(own, data)])
         order = torch.randperm(6000, generator=torch.Generator().manual_seed(index))[:4500]
-        reader = LsbReader.of(stego[order])
-        known = LsbReader.of(stego).salts.index(reader.salts[0])
+        reader = LowBitsReader.of(stego[order])
+        known = LowBitsReader.of(stego).salts.index(reader.salts[0])
         assert extract_derived(reader, own[known]) == data
 
 
@@ -361,7 +361,7 @@ def cover() -> Gaussians:
 
 
 def test_two_hidings_in_one_cover_have_no_salt_in_common(cover: Gaussians) -> None:
-    first, second = (LsbReader.of(embed(cover, [(KEY, b"x")])).salts for _ in range(2))
+    first, second = (LowBitsReader.of(embed(cover, [(KEY, b"x")])).salts for _ in range(2))
     assert len(set(first)) == len(set(second)) == 12
     assert not set(first) & set(second)
 
@@ -369,7 +369,7 @@ def test_two_hidings_in_one_cover_have_no_salt_in_common(cover: Gaussians) -> No
 def test_copies_count_once(cover: Gaussians) -> None:
     stego = embed(cover, [(KEY, PAYLOAD)])
     five = Gaussians.cat([stego] * 5)[torch.randperm(5 * len(stego))]
-    one, other = (LsbReader.of(model).open(KEY) for model in (stego, five))
+    one, other = (LowBitsReader.of(model).open(KEY) for model in (stego, five))
     assert one == other
     assert one.shards == other.shards
     assert other.foreign == 0
@@ -434,9 +434,9 @@ def test_fewer_foreign_gaussians_than_a_quarter_are_noticed(cover: Gaussians, le
 
 
 def test_bloom_filter_counts_foreign_gaussians() -> None:
-    ids = np.random.default_rng(0).integers(0, 256, (40_000, 16), np.uint8)
+    ids, key = np.random.default_rng(0).integers(0, 256, (40_000, 16), np.uint8), bytes(16)
     for count in (1, 100, 20_000):
-        own = bloom_filter(KEY.encode().ljust(16), ids[:count])
-        assert foreign_share(KEY.encode().ljust(16), ids[:count], own, count) == 0
-    assert 0.35 < foreign_share(KEY.encode().ljust(16), ids, own, 20_000) < 0.65
-    assert foreign_share(b"another data key", ids[:20_000], own, 20_000) > 0.8
+        record = exact_record(key, ids[:count])
+        assert exact_foreign(record, key, ids[:count]) == 0
+    assert 14_000 < exact_foreign(record, key, ids) < 26_000
+    assert exact_foreign(record, b"another data key", ids[:20_000]) > 16_000

@@ -17,18 +17,7 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from keyss.channels.base import (
-    METHOD_BYTES,
-    NOT_INDEPENDENT,
-    Capacity,
-    Channel,
-    Payload,
-    check_keys,
-    pack_payload,
-    randomness,
-    unpack_payload,
-    warned,
-)
+from keyss.channels.base import Capacity, Channel
 from keyss.channels.colours.carriers import SALTS, Carriers, find_salts
 from keyss.channels.colours.fountain import Fountain
 from keyss.channels.colours.header import (
@@ -43,12 +32,23 @@ from keyss.channels.colours.header import (
 )
 from keyss.channels.colours.planner import MIN_HEADERS, Layout, Planner, bucket_of
 from keyss.channels.colours.qim import COLUMNS, ONE, bit_counts, read, seeds, write
+from keyss.channels.container import (
+    METHOD_BYTES,
+    NOT_INDEPENDENT,
+    Payload,
+    check_keys,
+    randomness,
+    seal,
+    sealed_size,
+    unseal,
+    warned,
+)
 from keyss.channels.reed_solomon import LOST
 from keyss.core.arrays import Doubles, Flags
 from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import MASTER_BYTES, expand, stream
-from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
+from keyss.keys.encryption import OVERHEAD
 
 _TOO_FEW = "this cover has too few Gaussians to hide anything in colours that would survive other formats"
 _LOWER = 3  # maximum number of levels, each a quarter of a bit, below the planned one
@@ -56,7 +56,6 @@ _BITS_PER_GAUSSIAN = 1  # approximate capacity
 _HEADERS = 100  # approximate bytes
 _FURTHER = 0.8  # approximate share of the capacity that another secret leaves
 _OVERHEAD = METHOD_BYTES + 1  # maximum bytes of a payload beside its data
-_ASSOCIATED = b"keyss/v1/colours"  # associated data of a payload's authentication
 _CHANGED = 0.03  # share of carriers overwritten since
 _MAX_RATE = 4.0  # data bits per code bit; a writer stays below 0.5
 _ALIGNMENTS = 4  # offsets of log scales; the best one is wrong by at most 1/8 step in a scaled model
@@ -100,8 +99,8 @@ class ColoursCover:
 
     def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Also raises UsageError for a model that can carry nothing."""
-        packed = [pack_payload(payload) for _, payload in payloads]
-        secret = randomness(entropy, *packed)
+        contents = [payload for _, payload in payloads]
+        secret = randomness(entropy, contents)
         random = np.random.default_rng(np.frombuffer(stream(secret, "colours/random", 32), np.uint32))
         carriers = self.planner.carriers
         salt_rows, salts = find_salts(carriers)
@@ -109,7 +108,7 @@ class ColoursCover:
             raise UsageError(_TOO_FEW)
         secrets = [Secrets.of(key, salts) for key, _ in payloads]
         check_keys([each.static for each in secrets])
-        sizes = [compressed_size(each) + OVERHEAD for each in packed]
+        sizes = list(map(sealed_size, contents))
         found = self.planner.layouts(sizes)
         if found is None:
             raise UsageError(
@@ -131,7 +130,7 @@ class ColoursCover:
         headers = self._headers(layouts, sizes, file_key, carriers, _without_places(free, secrets, carriers))
         for lower in range(_LOWER + 1):  # the plan does not include the cost of headers and salts
             lowered = [replace(each, level=each.level and max(1, each.level - lower)) for each in headers]
-            stego = self._write(secrets, lowered, layouts, packed, carriers, free, random)
+            stego = self._write(secrets, lowered, layouts, contents, carriers, free, random)
             if layouts[0].level == ONE or not self.planner.is_visible(stego):
                 break
         return stego
@@ -161,7 +160,7 @@ class ColoursCover:
         secrets: Sequence[Secrets],
         headers: Sequence[Header],
         layouts: Sequence[Layout],
-        payloads: Sequence[bytes],
+        payloads: Sequence[Payload],
         carriers: Carriers,
         free: Flags,
         random: np.random.Generator,
@@ -181,9 +180,9 @@ class ColoursCover:
                 chosen[rows] = layouts[like].likely and self.planner.headers_may_skip
         for each, header, layout, payload in zip(secrets, headers, layouts, payloads, strict=False):
             rows, key = np.flatnonzero(free & header.carrier_mask(carriers)), each.data_key(header)
-            encrypted = encrypt(key, payload, _ASSOCIATED, size=bucket_bytes(header.bucket))
+            sealed = seal(key, payload, bucket_bytes(header.bucket))
             ids, bits = carriers.ids[rows], bit_counts(carriers.impact[rows], header.level)
-            data = np.unpackbits(np.frombuffer(encrypted, np.uint8))
+            data = np.unpackbits(np.frombuffer(sealed, np.uint8))
             code = Fountain(len(data)).encode(data, seeds(key, "seeds", ids, bits))
             values[rows], chosen[rows] = write(key, ids, values[rows], bits, code), layout.likely
         new = self.planner.statistics.imitate(values)
@@ -217,20 +216,17 @@ class ColoursReader:
             if header is None:
                 continue
             for shift in (0.0,) if header.level == ONE else (0.0, header.shift(carriers)):
-                found = _payload(header, secrets, carriers, shift)
-                if found is not None:
-                    share = found[1] if found[1] > _FOREIGN else 0.0
-                    return warned(replace(unpack_payload(found[0]), foreign=round(share * len(carriers))))
+                payload = _payload(header, secrets, carriers, shift)
+                if payload is not None:
+                    return warned(payload)
         if any(headers):
             raise InputError(LOST)
         _payload(_NOTHING, secrets, self.alignments[0], 0.0)
         raise WrongKeyError()
 
 
-def _payload(
-    header: Header, secrets: Secrets, carriers: Carriers, shift: float
-) -> tuple[bytes, float] | None:
-    """The payload decrypted by the header's data key, and the share of foreign carriers; or None."""
+def _payload(header: Header, secrets: Secrets, carriers: Carriers, shift: float) -> Payload | None:
+    """The payload decrypted by the header's data key, or None."""
     rows = np.flatnonzero(_without_places(header.carrier_mask(carriers), [secrets], carriers))
     size, key, ids = bucket_bytes(header.bucket), secrets.data_key(header), carriers.ids[rows]
     bits = bit_counts(carriers.impact[rows] - shift, header.level)
@@ -240,13 +236,14 @@ def _payload(
     values, words = read(key, ids, carriers.colours[rows, 1:], bits), seeds(key, "seeds", ids, bits)
     found = Fountain(8 * size).decode(words, np.repeat(sure, COLUMNS * bits) * values)
     try:
-        payload = decrypt(key, np.packbits(found).tobytes(), _ASSOCIATED)
+        payload = unseal(key, np.packbits(found).tobytes())[1]
     except InputError:
         return None
     agreement = values * (1 - 2.0 * Fountain(8 * size).encode(found, words))
     held = np.repeat((1 - header.idle * IDLE) * carriers.stability[rows], COLUMNS * bits)
     weights = np.repeat(carriers.weights[rows], COLUMNS * bits)
-    return payload, _foreign_share(agreement, held, weights)
+    share = _foreign_share(agreement, held, weights)
+    return replace(payload, foreign=round(share * len(carriers)) if share > _FOREIGN else 0)
 
 
 def _foreign_share(agreement: Doubles, held: Doubles, weights: Doubles) -> float:

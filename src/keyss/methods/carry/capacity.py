@@ -7,8 +7,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from keyss.channels import APPENDED, Capacity, Channel, PreparedCover
-from keyss.channels.base import NOT_INDEPENDENT
+from keyss.channels import APPENDED, NOT_INDEPENDENT, Capacity, Channel, PreparedCover
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.methods.carry.carry_options import CarryOptions

@@ -1,4 +1,4 @@
-"""The header of a secret in low bits, and the division of carriers between secrets.
+"""The division of carriers between secrets in low bits, and the messages of a header.
 
 A secret has a *header* of short messages (see `spread`): its data key, encrypted for each salt, and its
 parameters. Its payload is cut into shards with Reed-Solomon redundancy, one in each carrier of its share: any
@@ -9,18 +9,11 @@ secret's share depends on its own size only: the first that holds it of a quarte
 carriers at the least depth, and all of them at each larger one. Places for the headers of four secrets are
 reserved, however many there are. Secrets whose shares do not fit together get equal ones at the least depth
 at which they fit, by which the holder of one key can notice others.
-
-Numbers are little-endian. The parameters:
-
-    check (8 bytes, derived from the data key), version (1), method (15, padded with zeros), bytes of the
-    encrypted payload (4), depth (1), Gaussians of the model (4), codewords (4), shards of one (2), data
-    shards of one (2), a Bloom filter of the Gaussians (see `mixing`)
 """
 
 from __future__ import annotations
 
 import math
-import struct
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -28,23 +21,14 @@ from functools import lru_cache
 
 import numpy as np
 
-from keyss.channels.base import METHOD_BYTES, Capacity, pack_method, unpack_method
+from keyss.channels.base import Capacity
+from keyss.channels.container import MAX_OVERHEAD, PARAMETER_BYTES, Parameters
+from keyss.channels.foreign import EXACT_BYTES
 from keyss.channels.lsb.bits import DEPTHS, LEAST, Layout
-from keyss.channels.lsb.spread import (
-    Message,
-    Shards,
-    false_shards,
-    groups_of,
-    is_tagged,
-    shard_bytes,
-    whole_groups,
-)
+from keyss.channels.lsb.spread import Message, false_shards, groups_of, is_tagged, shard_bytes, whole_groups
 from keyss.channels.lsb.usable import SALTS
-from keyss.channels.mixing import BLOOM_BYTES
 from keyss.channels.reed_solomon import LOST, Codewords
 from keyss.core.errors import InputError, UsageError
-from keyss.keys.derivation import DerivedKey, expand
-from keyss.keys.encryption import OVERHEAD
 
 DATA_KEY_BYTES = 16
 # Places of each part of a data key, for each salt, and of each part of the parameters; two that can be read
@@ -61,11 +45,8 @@ _SPREAD = 4  # standard deviations by which a group may be smaller than the mean
 _FALSE_COST = 1.5  # shards that a false one costs: one that it contradicts, or two where it is an error
 MAX_CODEWORDS = 1 << 14
 
-_VERSION = 7
-_CHECK_BYTES = 8
-_PREFIX = struct.Struct(f"<B{METHOD_BYTES}sIBIIHH")
-_SIZE = _CHECK_BYTES + _PREFIX.size + BLOOM_BYTES
-_DAMAGED = "the hidden parameters are damaged"
+# Bytes of a sealed payload beside its data, at most.
+OVERHEAD = MAX_OVERHEAD + EXACT_BYTES
 
 
 @dataclass(frozen=True)
@@ -218,60 +199,22 @@ def key_message(secret: bytes, width: int) -> Message:
     return Message(secret, "key", DATA_KEY_BYTES, min(width, DATA_KEY_BYTES), _KEY_COPIES)
 
 
-def key_secret(key: DerivedKey) -> bytes:
-    """The secret of `key_message`."""
-    return key.expand("lsb/key", 32)
-
-
 def parameter_message(data_key: bytes, width: int) -> Message:
     """The message of the parameters, in rows of `width` bytes at the least depth."""
-    return Message(data_key, "parameters", _SIZE, width, _PARAMETER_COPIES)
+    return Message(data_key, "parameters", PARAMETER_BYTES, width, _PARAMETER_COPIES)
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """Parameters of a secret."""
-
-    method: str
-    size: int  # bytes of the encrypted payload
-    depth: int
-    gaussians: int  # size of the published model
-    codewords: Codewords
-    bloom: bytes
-
-    def pack(self, data_key: bytes) -> bytes:
-        code, name = self.codewords, pack_method(self.method)
-        fields = (self.size, self.depth, self.gaussians, code.count, code.n, code.k)
-        return _check(data_key) + _PREFIX.pack(_VERSION, name, *fields) + self.bloom
-
-    def shards(self, data_key: bytes, layout: Layout) -> Shards:
-        """The shards of the payload."""
-        return Shards(data_key, self.codewords, is_tagged(layout.width(self.depth)))
-
-    @staticmethod
-    def unpack(packed: bytes, data_key: bytes, layout: Layout) -> Parameters | None:
-        """None if the data key is wrong. Raises InputError for damage or loss."""
-        if packed[:_CHECK_BYTES] != _check(data_key):
-            return None
-        version, name, size, depth, gaussians, count, n, k = _PREFIX.unpack_from(packed, _CHECK_BYTES)
-        if version != _VERSION:
-            raise InputError(f"hidden secret of version {version}; this program reads version {_VERSION}")
-        try:
-            width = layout.width(depth) if depth in DEPTHS else 0
-            whole = 0 < count <= MAX_CODEWORDS and count == whole_groups(count, is_tagged(width))
-            if not whole or n > _LONGEST:
-                raise ValueError(f"{count} codewords of {n} shards at depth {depth}")
-            codewords = Codewords(count, n, k, shard_bytes(width))
-            method = unpack_method(name)
-        except ValueError as error:
-            raise InputError(f"{_DAMAGED}: {error}; {LOST}") from error
-        if not 0 < size <= codewords.size:
-            raise InputError(f"{_DAMAGED}: {size} bytes in {codewords}")
-        return Parameters(method, size, depth, gaussians, codewords, packed[-BLOOM_BYTES:])
-
-
-def _check(data_key: bytes) -> bytes:
-    return expand(data_key, "lsb/check", _CHECK_BYTES)
+def codewords_of(parameters: Parameters, layout: Layout) -> Codewords:
+    """The codewords that parameters describe. Raises InputError for impossible ones."""
+    depth, count, n, k = parameters.depth, parameters.count, parameters.n, parameters.k
+    try:
+        width = layout.width(depth) if depth in DEPTHS else 0
+        whole = 0 < count <= MAX_CODEWORDS and count == whole_groups(count, is_tagged(width))
+        if not whole or n > _LONGEST or shard_bytes(width) < 1:
+            raise ValueError(f"{count} codewords of {n} shards at depth {depth}")
+        return Codewords(count, n, k, shard_bytes(width))
+    except ValueError as error:
+        raise InputError(f"the hidden parameters are damaged: {error}; {LOST}") from error
 
 
 @lru_cache(maxsize=4096)
