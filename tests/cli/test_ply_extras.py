@@ -66,10 +66,10 @@ def test_convert_keeps_extra_properties(keyss: Run, tmp_path: Path, form: str) -
     ("what", "publish"),
     [
         ("--secret", ["unchanged"]),
-        ("--secret", ["any"]),
+        ("--secret", ["converted"]),
         ("--secret-file", ["unchanged"]),
-        ("--secret-file", ["any"]),
-        ("--secret-file", ["any", "--channel", "colours"]),
+        ("--secret-file", ["converted"]),
+        ("--secret-file", ["converted", "--channel", "colours"]),
     ],
 )
 def test_hide_keeps_extra_properties(keyss: Run, tmp_path: Path, what: str, publish: list[str]) -> None:
