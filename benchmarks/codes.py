@@ -64,7 +64,7 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         untouched = format_.quantise(model).dequantise()
         start = time.monotonic()
         prepared = QuantisedChannel(name).prepare(cover[1])
-        left = prepared.capacity.bytes - prepared.capacity.overhead
+        left = prepared.capacity.bytes
         kept = prune_to_size(own, left)
         encoded = encode_to_size(kept, left)
         stego = prepared.embed([(KEY, Payload("carry", encoded))])

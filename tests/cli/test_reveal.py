@@ -38,7 +38,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cover = trained_like(1500)
     prepared = LOW_BITS.prepare(cover)
     whole = prepared.embed([(KEY, Payload("carry", encode(trained_like(500, 1))))])
-    data = np.random.default_rng(0).bytes(prepared.capacity.bytes - prepared.capacity.overhead)
+    data = np.random.default_rng(0).bytes(prepared.capacity.bytes)
     full = prepared.embed([(KEY, Payload("carry", data))])
     models = {"plain": cover, "whole": whole, "pruned": whole[:1200], "few": full[:700]}
     for name, model in models.items():

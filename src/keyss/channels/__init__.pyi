@@ -8,7 +8,6 @@ from .colours.colours_channel import (
 )
 from .colours.fountain import Fountain as Fountain
 from .container import (
-    NOT_INDEPENDENT as NOT_INDEPENDENT,
     Parameters as Parameters,
     Payload as Payload,
     pack_payload as pack_payload,

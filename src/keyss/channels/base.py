@@ -13,22 +13,61 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
-from keyss.channels.container import Payload
+from keyss.channels.container import Payload, warn_of_others
 from keyss.core.gaussians import Gaussians
+
+
+def first_shares(shares: Sequence[tuple[float, int]], sizes: Sequence[int]) -> list[int] | None:
+    """For each size, the index of the first of `shares` that holds it; None if they exceed the whole.
+
+    `shares`: part of the whole capacity, and bytes that it holds, in ascending order. A secret's share does
+    not depend on others, which its key would reveal.
+    """
+    chosen = [next((i for i, (_, most) in enumerate(shares) if size <= most), None) for size in sizes]
+    fitting = [index for index in chosen if index is not None]
+    if len(fitting) < len(sizes) or sum(shares[index][0] for index in fitting) > 1:
+        return None
+    return fitting
 
 
 @dataclass(frozen=True)
 class Capacity:
-    """The capacity of a cover: exact for a prepared cover, an estimate before it is fitted."""
+    """The capacity of a cover, in bytes of data: exact for a prepared cover, an estimate for others."""
 
-    bytes: int  # of one payload
-    overhead: int  # maximum bytes of a payload beside its data
-    further: float = 1.0  # each payload after the first multiplies the bytes of all together by this
-    # Shares of one payload: part of the carriers, and bytes; None: a quarter, a half and all of `bytes`.
-    steps: tuple[tuple[float, int], ...] | None = None
-    equal: Callable[[int], int] | None = None  # bytes of each of several equal payloads; None: equal parts
-    divisible: bool = True  # False: several payloads have equal shares
+    shares: tuple[tuple[float, int], ...]  # that a payload may get; see `first_shares`
+    equal: Callable[[int], int]  # bytes of each of several payloads with equal shares
     grows: bool = False  # True if the model grows with the hidden data, which should then be short
+
+    @staticmethod
+    def of_sealed(
+        overhead: int, shares: Sequence[tuple[float, int]], equal: Callable[[int], int], grows: bool = False
+    ) -> Capacity:
+        """The capacity for data, from that for sealed payloads: they take up to `overhead` bytes more."""
+        own = tuple((part, max(0, size - overhead)) for part, size in shares)
+        return Capacity(own, lambda count: max(0, equal(count) - overhead), grows)
+
+    @property
+    def bytes(self) -> int:
+        """Of one payload."""
+        return self.shares[-1][1]
+
+    def limits(self, needed: Sequence[int]) -> list[int]:
+        """Maximum bytes of payloads that need `needed` bytes: of the first share that holds each.
+
+        If these shares exceed the whole, they are equal.
+        """
+        chosen = first_shares(self.shares, [min(size, self.bytes) for size in needed])
+        if chosen is None:
+            return [self.equal(len(needed))] * len(needed)
+        return [self.shares[index][1] for index in chosen]
+
+    def warn_of_sharing(self, needed: Sequence[int]) -> None:
+        """Warn (KeyssWarning) if a payload gets fewer bytes than it would alone."""
+        if any(
+            limit < min(size, self.limits([size])[0])
+            for size, limit in zip(needed, self.limits(needed), strict=True)
+        ):
+            warn_of_others()
 
 
 class PreparedCover(Protocol):

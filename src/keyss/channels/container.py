@@ -35,7 +35,7 @@ from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
 METHOD_BYTES = 15  # maximum length of a method's name
 MAX_OVERHEAD = OVERHEAD + METHOD_BYTES + 1  # bytes of a sealed payload beside its data and record, at most
 SALTS_TRIED = 4  # with half of the Gaussians changed, 15 of 16 models still open
-NOT_INDEPENDENT = (
+_NOT_INDEPENDENT = (
     "the secrets are too large, or too many, to be placed independently of each other: whoever holds one of "
     "the keys can notice that there are other secrets"
 )
@@ -181,6 +181,11 @@ def warned(payload: Payload) -> Payload:
     if payload.foreign:
         warnings.warn(_FOREIGN.format(payload.foreign), KeyssWarning, stacklevel=4)
     return payload
+
+
+def warn_of_others(why: str = _NOT_INDEPENDENT) -> None:
+    """Warn (KeyssWarning) that the holder of one key can tell that there are other secrets."""
+    warnings.warn(why, KeyssWarning, stacklevel=5)
 
 
 def key_secret(key: DerivedKey) -> bytes:

@@ -18,7 +18,6 @@ from channels.lsb.payloads import embed_payloads
 from channels.lsb.trained_like import keys, trained_like
 from files.formats.examples import KINDS, random_codes
 from keyss.channels import LOW_BITS, Codewords, LowBitsReader, Parameters, Payload, QuantisedCover, container
-from keyss.channels.lsb import low_bits, quantised
 from keyss.channels.lsb.low_bits_capacity import MAX_CODEWORDS
 from keyss.channels.reed_solomon import MAX_SHARDS
 from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
@@ -67,7 +66,7 @@ def test_parameters_that_name_more_than_there_is(
 ) -> None:
     hostile = Parameters(width, count)
     with monkeypatch.context() as patch:
-        patch.setattr(quantised, "Parameters", lambda *_: hostile)
+        patch.setattr(container, "Parameters", lambda *_: hostile)
         file = written(QuantisedCover.of(codes_of(".spz", 2500)), b"data")
     with pytest.raises(InputError, match="exceed the file"):
         opened(file)
@@ -130,7 +129,7 @@ def test_hostile_parameters_end_in_a_sentence(
 ) -> None:
     hostile = Parameters(depth, count, n, k)
     with monkeypatch.context() as patch:
-        patch.setattr(low_bits, "Parameters", lambda *_: hostile)
+        patch.setattr(container, "Parameters", lambda *_: hostile)
         stego = embed_payloads(LOW_BITS.prepare(cover), [(keys(), Payload("carry", b"x"))])
     reader = LowBitsReader.of(stego)
     with at_most(10), pytest.raises(InputError, match=r"the key is right|are damaged"):

@@ -23,8 +23,8 @@ IDS = np.random.default_rng(0).integers(0, 256, (CARRIERS, 16), np.uint8)
 OWN = keys(0)
 HIDINGS = 40
 CAPACITY = LowBitsCapacity(CARRIERS, {LEAST: CARRIERS}, LAYOUT)
-QUARTER = CAPACITY.for_payloads().steps[0][1] - 100  # bytes that fit into a quarter of these carriers
-THIRD = CAPACITY.payload_capacity(3) - 100  # bytes that fit into equal shares of three
+QUARTER = CAPACITY.for_payloads().shares[0][1]  # bytes that fit into a quarter of these carriers
+THIRD = CAPACITY.for_payloads().equal(3)  # bytes that fit into equal shares of three
 
 
 def _seen(sizes: Sequence[int]) -> list[float]:

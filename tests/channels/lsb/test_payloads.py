@@ -32,6 +32,7 @@ from keyss.channels import (
 from keyss.channels.container import SALTS_TRIED
 from keyss.channels.foreign import exact_foreign, exact_record
 from keyss.channels.lsb import spread
+from keyss.channels.lsb.low_bits_capacity import OVERHEAD
 from keyss.core import Gaussians, InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.files import read_model, write_model
 from keyss.keys import ALPHABET, DerivedKey, generate_key
@@ -284,23 +285,23 @@ def test_capacity_grows_with_the_model_and_is_kept_to() -> None:
 
 def test_a_secret_gets_the_least_share_that_holds_it() -> None:
     capacity = LowBitsCapacity.of(20_000, Layout(3))
-    steps = capacity.for_payloads().steps
+    steps = capacity.for_payloads().shares
     assert [part for part, _ in steps] == [0.25, 0.5, 1, 1, 1]
     sizes = [size for _, size in steps]
     assert sizes == sorted(sizes)
-    plans = [capacity.plan([size]) for size in sizes]
+    plans = [capacity.plan([size + OVERHEAD]) for size in sizes]
     assert [plan.depth for plan in plans] == [4, 4, 4, 6, 8]
     carriers = [plan.shares[0].carriers for plan in plans]
     assert carriers[0] < carriers[1] < carriers[2] == carriers[3] == carriers[4]
-    assert not capacity.plan([sizes[2], sizes[0]]).independent
+    assert not capacity.plan([sizes[2] + OVERHEAD, sizes[0] + OVERHEAD]).independent
 
 
 def test_more_than_the_places_of_header_and_shards_never_decides() -> None:
     """At the largest size of each share, with a quarter of the Gaussians lost at random."""
     model, own = trained_like(6000, 21), keys()
     prepared = LOW_BITS.prepare(model)
-    for index, (_, size) in enumerate(prepared.capacity.steps):
-        data = os.urandom(size - prepared.capacity.overhead)
+    for index, (_, size) in enumerate(prepared.capacity.shares):
+        data = os.urandom(size)
         stego = embed_derived(model, [(own, data)])
         order = torch.randperm(6000, generator=torch.Generator().manual_seed(index))[:4500]
         reader = LowBitsReader.of(stego[order])

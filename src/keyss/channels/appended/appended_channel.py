@@ -10,13 +10,13 @@ the number of secrets.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
+from keyss.channels import container
 from keyss.channels.appended import pilots
 from keyss.channels.appended.words import (
     HEADERS,
@@ -40,22 +40,12 @@ from keyss.channels.appended.words import (
     write_packets,
 )
 from keyss.channels.base import Capacity, Channel
-from keyss.channels.container import (
-    MAX_OVERHEAD,
-    Payload,
-    SaltedReader,
-    check_keys,
-    key_secret,
-    randomness,
-    seal,
-    sealed_size,
-    unseal_shards,
-)
+from keyss.channels.container import Payload, SaltedReader
 from keyss.channels.foreign import COARSE_BYTES, coarse_foreign, coarse_record
 from keyss.channels.mixing import random_order
 from keyss.channels.reed_solomon import Codewords
 from keyss.core.arrays import Bits, Doubles, Integers
-from keyss.core.errors import KeyssWarning, UsageError, WrongKeyError
+from keyss.core.errors import UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream
@@ -67,7 +57,7 @@ _LEFT, _DEVIATIONS, _MAX_DATA = 0.74, 4.2, 5895
 _WIDE, _NARROW, _WIDE_PACKETS = 8, 6, 90_000
 _MAX_PACKETS = 1_000_000  # data packets; a header holds up to 2^20
 _STEP = 256  # smallest difference between numbers of appended Gaussians
-_OVERHEAD = MAX_OVERHEAD + COARSE_BYTES
+_OVERHEAD = container.MAX_OVERHEAD + COARSE_BYTES
 
 # Search for the lattice's offset: Gaussians in which pilots are counted, maximum number of offsets, and
 # standard deviations by which pilots must outnumber accidental ones.
@@ -92,7 +82,8 @@ class Appended(Channel):
         return AppendedCover(cover)
 
     def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
-        return Capacity(MAX_BYTES, _OVERHEAD, grows=True)
+        shares = [(1.0, MAX_BYTES)]
+        return Capacity.of_sealed(_OVERHEAD, shares, lambda count: MAX_BYTES // count, grows=True)
 
     def appended_count(self, sizes: Sequence[int]) -> int:
         """The number of Gaussians appended for payloads of these compressed sizes in bytes."""
@@ -116,20 +107,20 @@ class AppendedCover:
         """The cover followed by the appended Gaussians. Warns if there is more than one secret."""
         model = self.cover.detach().to("cpu")
         to_world = own_frame(model)
-        secret = randomness(entropy, [payload for _, payload in payloads])
+        secret = container.randomness(entropy, [payload for _, payload in payloads])
         salt = expand(secret, "appended/salt", SALT_BYTES)
         random = np.random.default_rng(np.frombuffer(stream(secret, "appended/random", 32), np.uint32))
-        keys = [key_secret(DerivedKey.of(key, salt)) for key, _ in payloads]
-        check_keys(keys)
+        keys = [container.key_secret(DerivedKey.of(key, salt)) for key, _ in payloads]
+        container.check_keys(keys)
         if len(keys) > 1:
-            warnings.warn(_VISIBLE_SECRETS, KeyssWarning, stacklevel=2)
-        sizes = [sealed_size(payload, COARSE_BYTES) for _, payload in payloads]
+            container.warn_of_others(_VISIBLE_SECRETS)
+        sizes = [container.sealed_size(payload, COARSE_BYTES) for _, payload in payloads]
         every = [_codewords_for(size, len(sizes)) for size in sizes]
         total = _padded_count(every)
         words = [pilots.write(salt, pilots.count_for(total), random)]
         for data_key, (_, payload), codewords in zip(keys, payloads, every, strict=True):
             record = coarse_record(data_key, model, total, to_world.inverse())
-            sealed = seal(data_key, payload, codewords.size, record)
+            sealed = container.seal(data_key, payload, codewords.size, record)
             words.append(_words(data_key, codewords, sealed))
         words.append(_random_words(secret, total - sum(map(len, words))))
         # In random order, because sorting keeps the order of equal rotations.
@@ -170,15 +161,16 @@ class AppendedReader(SaltedReader):
 
     def extract(self, key: DerivedKey) -> Payload:
         """See `SaltedReader`."""
-        data_key = key_secret(key)
+        data_key = container.key_secret(key)
         for width in (_WIDE, _NARROW):
             needed = read_header(expand(data_key, f"header/{width}", 32), self.words, width)
             if needed:
                 numbers, data = read_packets(expand(data_key, "packets", 32), self.words, width)
                 codewords = _codewords(needed, width)
-                found = unseal_shards(data_key, codewords, numbers.astype(np.int64), data, COARSE_BYTES)
-                foreign = coarse_foreign(found[0], data_key, self.model, self.to_own)
-                return replace(found[1], foreign=foreign)
+                shards = numbers.astype(np.int64), data
+                record, payload = container.unseal_shards(data_key, codewords, *shards, COARSE_BYTES)
+                foreign = coarse_foreign(record, data_key, self.model, self.to_own)
+                return replace(payload, foreign=foreign)
         raise WrongKeyError()
 
 

@@ -12,7 +12,6 @@ others, random removal of a quarter leaves it no fresh one with p < 3e-4.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -23,20 +22,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from keyss.channels import container
 from keyss.channels.base import Capacity, Channel
-from keyss.channels.container import (
-    NOT_INDEPENDENT,
-    SALTS_TRIED,
-    Parameters,
-    Payload,
-    SaltedReader,
-    check_keys,
-    key_secret,
-    randomness,
-    seal,
-    sealed_size,
-    unseal_shards,
-)
+from keyss.channels.container import Payload, SaltedReader
 from keyss.channels.foreign import EXACT_BYTES, exact_foreign, exact_record
 from keyss.channels.lsb.bits import DEEPEST, LEAST, Layout, gaussian_ids, read_low_bits, write_low_bits
 from keyss.channels.lsb.low_bits_capacity import (
@@ -53,7 +41,7 @@ from keyss.channels.lsb.usable import Carriers, repeated, salt, salt_rows
 from keyss.channels.mixing import random_order
 from keyss.channels.reed_solomon import Codewords
 from keyss.core.arrays import Bytes, Flags, Integers
-from keyss.core.errors import KeyssWarning, UsageError, WrongKeyError
+from keyss.core.errors import UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.kernels.parallel import in_blocks
 from keyss.keys.derivation import MASTER_BYTES, DerivedKey, expand, fill, stream
@@ -76,9 +64,9 @@ class LowBits(Channel):
         if (found := self._found.get(cover)) is None or found[0] != versions:
             carriers = Carriers.of(cover, layout)
             rows = salt_rows(cover, carriers.ids, layout)
-            first = rows[: 2 * SALTS_TRIED]
+            first = rows[: 2 * container.SALTS_TRIED]
             stale = int((~carriers.usable[LEAST][first]).sum())
-            if stale >= SALTS_TRIED:
+            if stale >= container.SALTS_TRIED:
                 raise UsageError(
                     f"{stale} of the first {len(first)} salts of this cover cannot be renewed, and whoever "
                     "made it could try keys in advance"
@@ -108,7 +96,8 @@ class LowBitsCover:
 
     def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Takes 1.6 s for each secret for key derivation."""
-        mixed = randomness(entropy, [payload for _, payload in payloads], self.carriers.ids.tobytes())
+        contents = [payload for _, payload in payloads]
+        mixed = container.randomness(entropy, contents, self.carriers.ids.tobytes())
         salts = self._salts(mixed)[1]
         fresh = [salts[index] for index in self.fresh_salts]
         return self.embed_derived([(_derive(key, fresh), payload) for key, payload in payloads], mixed)
@@ -120,7 +109,7 @@ class LowBitsCover:
 
         `entropy`: the result of `randomness`, used for this file only.
         """
-        check_keys([keys[0].master for keys, _ in payloads])
+        container.check_keys([keys[0].master for keys, _ in payloads])
         parts = [(LEAST, self.salt_rows[self.fresh_salts], self._salts(entropy)[0])]
         parts += Writer(self._capacity, self._usable, self.carriers.ids, entropy).write(payloads)
         return write_low_bits(self.cover, self.layout, parts)
@@ -172,16 +161,16 @@ class Writer:
         Each payload comes with its key under every salt that is not stale. Raises UsageError for too large
         payloads. Warns (KeyssWarning) if the holder of one key can tell that there are other secrets.
         """
-        sizes = [sealed_size(payload, EXACT_BYTES) for _, payload in payloads]
+        sizes = [container.sealed_size(payload, EXACT_BYTES) for _, payload in payloads]
         plan = self.capacity.plan(sizes)
         if not plan.independent and len(payloads) > 1:
-            warnings.warn(NOT_INDEPENDENT, KeyssWarning, stacklevel=4)
+            container.warn_of_others()
         rows = np.flatnonzero(self.usable[plan.depth])
         noise = np.empty((len(rows), self.capacity.layout.width(plan.depth)), np.uint8)
         fill(self.entropy, "lsb/noise", noise)
         for attempt in count():  # until no group of shards is too small
             free = self.usable[plan.depth].copy()
-            headers, data_keys = self._headers(f"{attempt}", plan, [keys for keys, _ in payloads], free)
+            headers, data_keys = self._headers(attempt, plan, [keys for keys, _ in payloads], free)
             left = np.flatnonzero(free)
             left = left[random_order(self.entropy, f"lsb/shards/{attempt}", len(left))]
             bodies = list[Part]()
@@ -191,7 +180,7 @@ class Writer:
                 if (numbers := shards.numbers(self.ids[own])) is None:
                     break
                 record = exact_record(data_key, self.ids)
-                sealed = seal(data_key, payload, share.codewords.size, record)
+                sealed = container.seal(data_key, payload, share.codewords.size, record)
                 contents = share.codewords.encode(sealed)[numbers]
                 bodies.append((plan.depth, own, shards.encrypt(self.ids[own], numbers, contents)))
             else:
@@ -199,38 +188,31 @@ class Writer:
         raise AssertionError
 
     def _headers(
-        self, attempt: str, plan: Plan, keys: Sequence[Sequence[DerivedKey]], free: Flags
+        self, attempt: int, plan: Plan, keys: Sequence[Sequence[DerivedKey]], free: Flags
     ) -> tuple[list[Part], list[bytes]]:
         """The headers of all secrets, and their data keys; their places are not `free` [N] any more.
 
         Missing headers take places, too: otherwise collisions would tell how many there are.
         """
         total = max(MAX_INDEPENDENT if plan.independent else 0, len(keys))
-        data_keys = [self._secret(f"data-key/{attempt}/{each}", DATA_KEY_BYTES) for each in range(total)]
-        parts = list[Part]()
+        data_keys = [self._secret(f"data-key/{attempt}/{index}", DATA_KEY_BYTES) for index in range(total)]
+        width, parts = self.capacity.layout.width(LEAST), list[Part]()
         for index in random_order(self.entropy, f"lsb/headers/{attempt}", total).tolist():
+            own: Sequence[DerivedKey] = [
+                DerivedKey(self._secret(f"no-key/{index}/{n}")) for n in range(len(keys[0]))
+            ]
+            packed = b""
             if index < len(keys):
-                code = plan.shares[index].codewords
-                packed = Parameters(plan.depth, code.count, code.n, code.k).pack(data_keys[index])
-                parts += self._header(free, data_keys[index], keys[index], packed)
-            else:
-                nobody = [DerivedKey(self._secret(f"no-key/{index}/{n}")) for n in range(len(keys[0]))]
-                self._header(free, data_keys[index], nobody, b"")
+                own, code = keys[index], plan.shares[index].codewords
+                packed = container.Parameters(plan.depth, code.count, code.n, code.k).pack(data_keys[index])
+            messages = [(parameter_message(data_keys[index], width), packed)]
+            messages += [(key_message(container.key_secret(key), width), data_keys[index]) for key in own]
+            for message, data in messages:
+                rows, contents = message.write(self.ids, data)
+                if index < len(keys):
+                    parts.append((LEAST, rows[free[rows]], contents[free[rows]]))
+                free[rows] = False
         return parts, data_keys
-
-    def _header(
-        self, free: Flags, data_key: bytes, keys: Sequence[DerivedKey], parameters: bytes
-    ) -> list[Part]:
-        """The messages of a header in their places that are `free` [N], which are so no longer."""
-        width, parts = self.capacity.layout.width(LEAST), []
-        messages = [(parameter_message(data_key, width), parameters)]
-        messages += [(key_message(key_secret(key), width), data_key) for key in keys]
-        for message, data in messages:
-            rows, contents = message.write(self.ids, data)
-            own = free[rows]
-            free[rows] = False
-            parts.append((LEAST, rows[own], contents[own]))
-        return parts
 
     def _secret(self, label: str, size: int = MASTER_BYTES) -> bytes:
         return expand(self.entropy, f"lsb/{label}", size)
@@ -259,16 +241,16 @@ class LowBitsReader(SaltedReader):
     def extract(self, key: DerivedKey) -> Payload:
         """See `SaltedReader`. A wrong key makes all passes with a data key that matches nothing."""
         width = self.layout.width(LEAST)
-        data_key = key_message(key_secret(key), width).read(self.ids, self.low)
+        data_key = key_message(container.key_secret(key), width).read(self.ids, self.low)
         packed = parameter_message(data_key, width).read(self.ids, self.low)
-        found = Parameters.unpack(packed, data_key)
+        found = container.Parameters.unpack(packed, data_key)
         if found is None:
             none = Codewords(1, 1, 1, shard_bytes(self.layout.width(DEEPEST)))
             self._shards(data_key, none, DEEPEST)
             raise WrongKeyError()
         codewords = codewords_of(found, self.layout)
         numbers, shards = self._shards(data_key, codewords, found.depth)
-        record, payload = unseal_shards(data_key, codewords, numbers, shards, EXACT_BYTES)
+        record, payload = container.unseal_shards(data_key, codewords, numbers, shards, EXACT_BYTES)
         return replace(
             payload,
             shards=(len(np.unique(numbers)), codewords.shards),

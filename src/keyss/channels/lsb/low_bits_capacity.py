@@ -21,7 +21,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from keyss.channels.base import Capacity
+from keyss.channels.base import Capacity, first_shares
 from keyss.channels.container import MAX_OVERHEAD, PARAMETER_BYTES, Parameters
 from keyss.channels.foreign import EXACT_BYTES
 from keyss.channels.lsb.bits import DEPTHS, LEAST, Layout
@@ -51,9 +51,11 @@ OVERHEAD = MAX_OVERHEAD + EXACT_BYTES
 
 @dataclass(frozen=True)
 class Share:
-    """Carriers of a secret, and the codewords in them."""
+    """Carriers of a secret at a depth, and the codewords in them."""
 
+    part: float  # of all carriers
     carriers: int
+    depth: int
     codewords: Codewords
 
 
@@ -80,17 +82,8 @@ class LowBitsCapacity:
         return LowBitsCapacity(gaussians, dict.fromkeys(DEPTHS, int(TYPICAL_SHARE * gaussians)), layout)
 
     def for_payloads(self) -> Capacity:
-        ladder = self._ladder or [(1.0, 0, depth) for depth in self.carriers]
-        steps = [(part, self._size(count, depth)) for part, count, depth in ladder]
-        if not self._ladder:
-            steps = [(1.0, self.payload_capacity(1))]
-        return Capacity(
-            steps[-1][1],
-            OVERHEAD,
-            equal=self.payload_capacity,
-            steps=tuple(steps),
-            divisible=bool(self._ladder),
-        )
+        shares = self._sizes(self._ladder) or [(1.0, self.payload_capacity(1))]
+        return Capacity.of_sealed(OVERHEAD, shares, self.payload_capacity)
 
     @property
     def header_carriers(self) -> int:
@@ -99,23 +92,21 @@ class LowBitsCapacity:
         return SALTS * key_message(b"", width).places + parameter_message(b"", width).places
 
     def plan(self, sizes: Sequence[int]) -> Plan:
-        """Shares for encrypted payloads of `sizes` bytes.
+        """Shares for sealed payloads of `sizes` bytes.
 
         Raises UsageError, with the number of Gaussians that would suffice.
         """
         ladder = self._ladder if len(sizes) <= MAX_INDEPENDENT else []
-        found = [next((each for each in ladder if self._size(*each[1:]) >= size), None) for size in sizes]
-        fitting = [each for each in found if each is not None]
-        if len(fitting) == len(sizes) and sum(part for part, _, _ in fitting) <= 1:
-            return Plan(max(depth for _, _, depth in fitting), self._shares(fitting, sizes), True)
+        if chosen := first_shares(self._sizes(ladder), sizes):
+            return self._plan([ladder[index] for index in chosen], sizes, True)
         for depth in self.carriers:
-            equal = (1 / len(sizes), self._equal(len(sizes), depth), depth)
-            if self._size(*equal[1:]) >= max(sizes):
-                return Plan(depth, self._shares([equal] * len(sizes), sizes), False)
+            equal = self._share(1 / len(sizes), self._equal(len(sizes), depth), depth)
+            if equal and equal.codewords.size >= max(sizes):
+                return self._plan([equal] * len(sizes), sizes, False)
         raise UsageError(self.too_small(max(sizes), len(sizes)))
 
     def payload_capacity(self, secrets: int) -> int:
-        """Maximum bytes of each of `secrets` encrypted payloads with equal shares; may be 0."""
+        """Maximum bytes of each of `secrets` sealed payloads with equal shares; may be 0."""
         return max(self._size(self._equal(secrets, depth), depth) for depth in self.carriers)
 
     def too_small(self, size: int, secrets: int) -> str:
@@ -135,36 +126,44 @@ class LowBitsCapacity:
         )
 
     @property
-    def _ladder(self) -> list[tuple[float, int, int]]:
-        """Part of the carriers, carriers and depth of each share, in the order of capacity.
+    def _ladder(self) -> list[Share]:
+        """The shares that a secret may get, in the order of capacity.
 
         Empty if the headers of four secrets would take too many carriers.
         """
-        reserved, steps = MAX_INDEPENDENT * self.header_carriers, list[tuple[float, int, int]]()
+        reserved, ladder = MAX_INDEPENDENT * self.header_carriers, list[Share]()
         for part, depth in ((0.25, LEAST), (0.5, LEAST), *((1.0, depth) for depth in self.carriers)):
-            count = int(part * (self.carriers[depth] - reserved))
             if reserved > _MAX_RESERVED * self.carriers[depth]:
                 continue
-            if self._size(count, depth) > (self._size(*steps[-1][1:]) if steps else 0):
-                steps.append((part, count, depth))
-        return steps
+            share = self._share(part, int(part * (self.carriers[depth] - reserved)), depth)
+            if share and (not ladder or share.codewords.size > ladder[-1].codewords.size):
+                ladder.append(share)
+        return ladder
+
+    @staticmethod
+    def _sizes(shares: Sequence[Share]) -> list[tuple[float, int]]:
+        return [(share.part, share.codewords.size) for share in shares]
 
     def _equal(self, secrets: int, depth: int) -> int:
         """Carriers for the shards of each of `secrets` payloads with equal shares."""
         return max(0, self.carriers[depth] // secrets - self.header_carriers)
 
-    def _shares(self, steps: Sequence[tuple[float, int, int]], sizes: Sequence[int]) -> list[Share]:
-        shares = []
-        for (_, count, depth), size in zip(steps, sizes, strict=True):
-            codewords = self._codewords(count, depth, size)
-            assert codewords is not None  # the size was compared with the capacity
-            shares.append(Share(count, codewords))
-        return shares
+    def _plan(self, shares: Sequence[Share], sizes: Sequence[int], independent: bool) -> Plan:
+        own = [
+            self._share(share.part, share.carriers, share.depth, size)
+            for share, size in zip(shares, sizes, strict=True)
+        ]
+        return Plan(max(share.depth for share in shares), [share for share in own if share], independent)
 
     def _size(self, count: int, depth: int) -> int:
-        """Maximum bytes of an encrypted payload in `count` carriers at a depth."""
-        codewords = self._codewords(count, depth)
-        return codewords.size if codewords else 0
+        """Maximum bytes of a sealed payload in `count` carriers at a depth."""
+        share = self._share(1.0, count, depth)
+        return share.codewords.size if share else 0
+
+    def _share(self, part: float, count: int, depth: int, size: int | None = None) -> Share | None:
+        """The share with the codewords of `_codewords`, if there are any."""
+        codewords = self._codewords(count, depth, size)
+        return Share(part, count, depth, codewords) if codewords else None
 
     def _codewords(self, count: int, depth: int, size: int | None = None) -> Codewords | None:
         """The most redundant code of `size` bytes (None: the maximum) in `count` carriers at a depth.

@@ -16,21 +16,9 @@ from functools import cached_property
 import numpy as np
 import torch
 
+from keyss.channels import container
 from keyss.channels.base import Capacity, Channel
-from keyss.channels.container import (
-    MAX_OVERHEAD,
-    PARAMETER_BYTES,
-    Parameters,
-    Payload,
-    SaltedReader,
-    check_keys,
-    check_of,
-    key_secret,
-    randomness,
-    seal,
-    sealed_size,
-    unseal,
-)
+from keyss.channels.container import Payload, SaltedReader
 from keyss.channels.lsb import wet_paper
 from keyss.channels.lsb.decoded import Decoded
 from keyss.channels.lsb.fields import (
@@ -82,7 +70,7 @@ class QuantisedChannel(Channel):
         return QuantisedCover.of(self.decoded.codes, replace(self.decoded, model=cover.detach().to("cpu")))
 
     def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
-        return Capacity(gaussians * _BITS_PER_GAUSSIAN // 8, _overhead(wet_paper.BLOCK // 8))
+        return _capacity(gaussians * _BITS_PER_GAUSSIAN // 8, wet_paper.BLOCK // 8)
 
 
 @dataclass(frozen=True)
@@ -93,11 +81,11 @@ class QuantisedCover:
     fields: list[Field]
     free: list[Flags]  # [N] per field: levels that may be written
     model_hash: bytes
-    decoded: Decoded | None = None  # in the same order; its model is published instead of the codes
+    decoded: Decoded | None = None  # in the same order; its model is published instead of the file
 
     @staticmethod
     def of(codes: Codes, decoded: Decoded | None = None) -> QuantisedCover:
-        """`decoded`: its model is published instead of the codes. Raises UsageError for no capacity."""
+        """`decoded`: its model is published instead of the file. Raises UsageError for no capacity."""
         rows, ordered, own = in_counted_order(codes, decoded.exact if decoded else None)
         model = decoded[rows] if decoded else None
         own_hash = model_hash(ordered, model.model if model else None)
@@ -139,7 +127,7 @@ class QuantisedCover:
 
     @cached_property
     def capacity(self) -> Capacity:
-        return Capacity((len(self.ids) - 1) * self.width, _overhead(self.width))
+        return _capacity((len(self.ids) - 1) * self.width, self.width)
 
     @property
     def cover(self) -> Gaussians:
@@ -148,14 +136,14 @@ class QuantisedCover:
     def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`."""
         contents = [payload for _, payload in payloads]
-        mixed = randomness(entropy, contents, _digest(self.codes))
+        mixed = container.randomness(entropy, contents, _digest(self.codes))
         for attempt in range(_ATTEMPTS):
             own = expand(mixed, f"lsb/attempt/{attempt}", 32)
             table = np.empty((len(self.ids), self.width), np.uint8)
             fill(own, "lsb/noise", table)
             first = salt(self.ids[0], table[0, :LEAST_BYTES])
-            keys = [key_secret(DerivedKey.of(key, first)) for key, _ in payloads]
-            check_keys(keys)
+            keys = [container.key_secret(DerivedKey.of(key, first)) for key, _ in payloads]
+            container.check_keys(keys)
             self._write(table, own, keys, contents)
             if (bits := self._solve(table, own)) is not None:
                 return self._model_to_publish(self._with_bits(bits, own), own)
@@ -166,7 +154,7 @@ class QuantisedCover:
     ) -> None:
         """Write payloads, each under its data key, into the blocks [C, width] of `table`."""
         ids, blocks = self.ids[1:], table[1:]
-        counts = [-(-sealed_size(payload) // self.width) for payload in payloads]
+        counts = [-(-container.sealed_size(payload) // self.width) for payload in payloads]
         if (free := len(blocks) - sum(counts) - len(counts)) < 0:
             raise UsageError(
                 f"the secrets take {self.width * (len(blocks) - free):,} bytes, and this cover has room for "
@@ -177,10 +165,10 @@ class QuantisedCover:
         for index in random_order(entropy, "lsb/along", len(payloads)).tolist():
             data_key, count = data_keys[index], counts[index]
             header, *rows = (first + gaps.pop(0) + np.arange(count + 1, dtype=np.uint64)) % len(blocks)
-            packed = Parameters(self.width, count).pack(data_key)
+            packed = container.Parameters(self.width, count).pack(data_key)
             pads = parameter_pads(data_key, ids[header, None])
-            blocks[header, :PARAMETER_BYTES] = np.frombuffer(packed, np.uint8) ^ pads
-            sealed = seal(data_key, payloads[index], count * self.width)
+            blocks[header, : len(packed)] = np.frombuffer(packed, np.uint8) ^ pads
+            sealed = container.seal(data_key, payloads[index], count * self.width)
             blocks[rows] = np.frombuffer(sealed, np.uint8).reshape(-1, self.width)
             first += count + 1
 
@@ -199,7 +187,7 @@ class QuantisedCover:
         return bits
 
     def _with_bits(self, bits: Bits, entropy: bytes) -> Codes:
-        """The codes with new last `bits` of all levels."""
+        """The quantised values with new last `bits` of all levels."""
         columns: dict[str, list[Levels]] = {}
         parts = np.split(bits, np.cumsum([each.total_bits for each in self.fields])[:-1])
         for field, free, own in zip(self.fields, self.free, parts, strict=True):
@@ -242,23 +230,24 @@ class QuantisedReader(SaltedReader):
 
     def extract(self, key: DerivedKey) -> Payload:
         """See `SaltedReader`."""
-        data_key = key_secret(key)
-        opened = self.blocks[:, :PARAMETER_BYTES] ^ parameter_pads(data_key, self.ids)
-        check = np.frombuffer(check_of(data_key), np.uint8)
+        data_key = container.key_secret(key)
+        opened = self.blocks[:, : container.PARAMETER_BYTES] ^ parameter_pads(data_key, self.ids)
+        check = np.frombuffer(container.check_of(data_key), np.uint8)
         rows = np.flatnonzero((opened[:, : len(check)] == check).all(axis=1))
-        found = Parameters.unpack(opened[rows[0]].tobytes(), data_key) if len(rows) else None
+        found = container.Parameters.unpack(opened[rows[0]].tobytes(), data_key) if len(rows) else None
         if found is None:
             raise WrongKeyError()
         width, count = found.depth, found.count
         if not 0 < count < len(self.blocks) or not 0 < width <= self.blocks.shape[1]:
             raise InputError("the hidden parameters are damaged: the data they describe exceed the file")
         rows = (rows[0] + 1 + np.arange(count)) % len(self.blocks)
-        return unseal(data_key, self.blocks[rows, :width].tobytes())[1]
+        return container.unseal(data_key, self.blocks[rows, :width].tobytes())[1]
 
 
-def _overhead(width: int) -> int:
-    """Maximum bytes of a payload beside its data, in blocks of `width` bytes."""
-    return 2 * width + MAX_OVERHEAD
+def _capacity(total: int, width: int) -> Capacity:
+    """Of `total` bytes in blocks of `width`, of which one holds parameters and the last may not be full."""
+    shares = [(1 / part, total // part) for part in (4, 2, 1)]
+    return Capacity.of_sealed(2 * width + container.MAX_OVERHEAD, shares, lambda count: total // count)
 
 
 def _digest(codes: Codes) -> bytes:
