@@ -78,8 +78,8 @@ class Design:
     densification: Scenes = "both"  # scenes whose gradients count (combined densification)
     # Share of the cap that the points fill at most. With more, density control would have no room (ours).
     start_share: float = 1 / 3
-    # Share of the steps that render all scenes from one pose; the paper does not say. In the others each has a
-    # photo of its own: renders from foreign poses, where no photo was taken, are poor targets.
+    # Share of the steps that render all scenes from one pose; the paper does not say. In the others each
+    # has a photo of its own: renders from foreign poses, where no photo was taken, are poor targets.
     common_poses: float = 0.25
     # Rate of AdamW in runs of 30,000 steps. Shorter runs raise it as they raise the Gaussians' rates
     # (`keyss.fitting.schedule.boost_of`), and all runs let it decay to 5 %. The paper gives none.
