@@ -82,36 +82,34 @@ class Carriers:
     """The Gaussians of a cover that may be written, by depth."""
 
     ids: Bytes  # [N, 16] of all Gaussians
-    usable: dict[int, Flags]  # [N] masks by depth, of the depths at which new low bits do not show
+    usable: dict[int, Flags]  # [N] the same mask for each depth at which new low bits do not show
 
     @staticmethod
-    def of(gaussians: Gaussians, layout: Layout, depths: tuple[int, ...] = DEPTHS) -> Carriers:
-        """Raises UsageError, with what shows, if new low bits would show even at the first of `depths`.
+    def of(gaussians: Gaussians, layout: Layout) -> Carriers:
+        """Raises UsageError, with what shows, if new low bits would show even at the least depth.
 
-        A sample of a large cover is tested first: the whole takes a second for each 40,000 Gaussians.
+        A sample of a large cover is tested first: the whole takes a second for each 200,000 Gaussians.
         """
         if len(gaussians) > _LARGE:
             sample = gaussians[:: len(gaussians) // _SAMPLE]
-            Carriers.of(sample, Layout.of(sample), depths[:1])
+            Carriers.of(sample, Layout.of(sample))
         ids = gaussian_ids(gaussians, layout)
         steps = Steps(gaussians, layout)
-        fine, usable = _without_copies(gaussians, layout, ids), dict[int, Flags]()
-        for depth in depths:
-            usable[depth] = fine & ~steps.equal(depth)
-            if depth == depths[0]:
-                fine &= _large_enough(gaussians, layout, usable[depth])
-                usable[depth] &= fine
-            if told := _what_tells(gaussians, layout, usable[depth], depth, steps):
-                del usable[depth]
-                if not usable:
+        usable = _without_copies(gaussians, layout, ids) & ~steps.equal(DEEPEST)
+        usable &= _large_enough(gaussians, layout, usable)
+        written = dict[int, Flags]()
+        for depth in DEPTHS:
+            if told := _what_tells(gaussians, layout, usable, depth, steps):
+                if depth == LEAST:
                     raise UsageError(told)
                 break
-        return Carriers(ids, usable)
+            written[depth] = usable
+        return Carriers(ids, written)
 
 
-def usable_carriers(gaussians: Gaussians, depth: int = DEEPEST) -> Flags:
-    """Mask [N] of the usable Gaussians at a depth. Raises UsageError as `Carriers.of`."""
-    return Carriers.of(gaussians, Layout.of(gaussians), (depth,)).usable[depth]
+def usable_carriers(gaussians: Gaussians) -> Flags:
+    """Mask [N] of the usable Gaussians. Raises UsageError as `Carriers.of`."""
+    return Carriers.of(gaussians, Layout.of(gaussians)).usable[LEAST]
 
 
 def _what_tells(gaussians: Gaussians, layout: Layout, usable: Flags, depth: int, steps: Steps) -> str:
