@@ -71,6 +71,7 @@ _SATURATED = np.uint32(0x41800000), np.uint32(0x80000000)
 _PRUNED = np.float32(math.log(0.005 / 0.995)).view(np.uint32) | LOW  # the logit of 0.005, without low bits
 _MIN_USABLE = 0.05  # share of the Gaussians of a cover
 _LARGE_ENOUGH = 118  # biased exponent: optimisers with large last steps leave zeros in numbers below 2^-9
+_FIRST = 1 << 12  # Gaussians of the smallest IDs, of which most models have enough for salts
 _SETS_BY_CHANCE = 0.1  # maximum expected number of sets of equal values by chance
 _SAMPLE = 20_000  # Gaussians whose bits are tested
 _LARGE = 10 * _SAMPLE  # Gaussians of a cover whose sample is tested first
@@ -163,16 +164,21 @@ def chance_of_bits(words: Words32, bits: int) -> float:
 
 def salt_rows(gaussians: Gaussians, ids: Bytes, layout: Layout) -> Integers:
     """Rows of the salts' Gaussians, at most SALTS, in the order of the salts; `ids` [N, 16]."""
-    late = np.where(moved_from_zero(gaussians, layout), np.uint64(255), _smallness(gaussians, layout))
-    keys = late << np.uint64(56) | ids[:, :8].copy().view(">u8")[:, 0].astype(np.uint64) >> np.uint64(8)
+    numbers = ids[:, :8].copy().view(">u8")[:, 0].astype(np.uint64)
+    rows = np.argpartition(numbers, _FIRST)[:_FIRST] if len(ids) > _FIRST else np.arange(len(ids))
+    late = _lateness(gaussians[torch.from_numpy(rows)], layout)
+    if (late == 0).sum() < SALTS:  # of the smallest IDs too few
+        rows, late = np.arange(len(ids)), _lateness(gaussians, layout)
+    keys = late << np.uint64(56) | numbers[rows] >> np.uint64(8)
     best = np.argpartition(keys, SALTS - 1)[:SALTS] if len(keys) > SALTS else np.arange(len(keys))
-    low = read_low_bits(gaussians[torch.from_numpy(best)], LEAST, layout)
-    order = sorted(range(len(best)), key=lambda i: (late[best[i]], ids[best[i]].tobytes(), low[i].tobytes()))
-    return best[order]
+    low = read_low_bits(gaussians[torch.from_numpy(rows[best])], LEAST, layout)
+    places = [(late[each], ids[rows[each]].tobytes(), own.tobytes()) for each, own in zip(best, low, strict=True)]
+    return rows[best[sorted(range(len(best)), key=places.__getitem__)]]
 
 
-def _smallness(gaussians: Gaussians, layout: Layout) -> Words:
-    """[N] octaves by which the smallest even number lies below _LARGE_ENOUGH; 0 for larger ones."""
+def _lateness(gaussians: Gaussians, layout: Layout) -> Words:
+    """[N] 255 for Gaussians that moved by equal steps away from zero; else the octaves by which the smallest
+    even number lies below _LARGE_ENOUGH, 0 for larger ones."""
 
     def work(start: int, stop: int) -> Words:
         used = used_words(gaussians[start:stop])[:, layout.columns]
@@ -180,7 +186,8 @@ def _smallness(gaussians: Gaussians, layout: Layout) -> Words:
         smallness: Words = below.max(axis=1, initial=0).astype(np.uint64)
         return smallness
 
-    return np.concatenate([np.zeros(0, np.uint64), *in_blocks(work, len(gaussians), BLOCK)])
+    small = np.concatenate([np.zeros(0, np.uint64), *in_blocks(work, len(gaussians), BLOCK)])
+    return np.where(moved_from_zero(gaussians, layout), np.uint64(255), small)
 
 
 def salt(carrier_id: Bytes, low: Bytes) -> bytes:
