@@ -22,7 +22,7 @@ CARRIERS, LAYOUT = 4000, Layout(3)
 IDS = np.random.default_rng(0).integers(0, 256, (CARRIERS, 16), np.uint8)
 OWN = keys(0)
 HIDINGS = 40
-CAPACITY = LowBitsCapacity(CARRIERS, {LEAST: CARRIERS}, LAYOUT)
+CAPACITY = LowBitsCapacity(CARRIERS, CARRIERS, LAYOUT, (LEAST,))
 QUARTER = CAPACITY.for_payloads().shares[0][1]  # bytes that fit into a quarter of these carriers
 THIRD = CAPACITY.for_payloads().equal(3)  # bytes that fit into equal shares of three
 
@@ -30,7 +30,7 @@ THIRD = CAPACITY.for_payloads().equal(3)  # bytes that fit into equal shares of 
 def _seen(sizes: Sequence[int]) -> list[float]:
     """What the holder of the first key can count of its own rows, and of all others together."""
     payloads = [Payload("test", os.urandom(size)) for size in sizes]
-    writer = Writer(CAPACITY, {LEAST: np.ones(CARRIERS, bool)}, IDS, os.urandom(32))
+    writer = Writer(CAPACITY, np.ones(CARRIERS, bool), IDS, os.urandom(32))
     low = np.empty((CARRIERS, LAYOUT.width(LEAST)), np.uint8)
     for _, rows, data in writer.write([([k] * SALTS, each) for k, each in zip(OWN, payloads, strict=False)]):
         low[rows, : data.shape[1]] = data

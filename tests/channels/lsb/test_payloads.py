@@ -275,7 +275,7 @@ def test_capacity_grows_with_the_model_and_is_kept_to() -> None:
             assert plan.independent == (capacity.gaussians >= 8000)
             assert plan.depth == 4
             taken = sum(share.carriers for share in plan.shares) + secrets * capacity.header_carriers
-            assert taken <= capacity.carriers[plan.depth]
+            assert taken <= capacity.carriers
         largest = capacity.payload_capacity(1)
         assert size <= largest < 1.5 * size
         assert capacity.plan([largest]).depth == 8

@@ -12,7 +12,7 @@ others, random removal of a quarter leaves it no fresh one with p < 3e-4.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import count
@@ -120,16 +120,16 @@ class LowBitsCover:
         return np.flatnonzero(self.carriers.usable[LEAST][self.salt_rows])
 
     @cached_property
-    def _usable(self) -> dict[int, Flags]:
-        """[N] masks, by depth, without the Gaussians of salts."""
-        others = np.ones(len(self.cover), bool)
-        others[self.salt_rows] = False
-        return {depth: usable & others for depth, usable in self.carriers.usable.items()}
+    def _usable(self) -> Flags:
+        """[N] mask of usable Gaussians, without those of salts."""
+        usable = self.carriers.usable[LEAST].copy()
+        usable[self.salt_rows] = False
+        return usable
 
     @cached_property
     def _capacity(self) -> LowBitsCapacity:
-        counts = {depth: int(usable.sum()) for depth, usable in self._usable.items()}
-        return LowBitsCapacity(len(self.cover), counts, self.layout)
+        count, depths = int(self._usable.sum()), tuple(self.carriers.usable)
+        return LowBitsCapacity(len(self.cover), count, self.layout, depths)
 
     def _salts(self, entropy: bytes) -> tuple[Bytes, list[bytes]]:
         """New low bits [F, B] of the Gaussians of fresh salts, and all salts with these low bits."""
@@ -145,13 +145,13 @@ class LowBitsCover:
 
 @dataclass(frozen=True)
 class Writer:
-    """Writes payloads into the `usable` [N] Gaussians, by depth, of a model with `ids` [N, 16].
+    """Writes payloads into the `usable` [N] Gaussians of a model with `ids` [N, 16].
 
     `entropy`: 32 secret bytes.
     """
 
     capacity: LowBitsCapacity
-    usable: Mapping[int, Flags]
+    usable: Flags
     ids: Bytes
     entropy: bytes
 
@@ -165,11 +165,11 @@ class Writer:
         plan = self.capacity.plan(sizes)
         if not plan.independent and len(payloads) > 1:
             container.warn_of_others()
-        rows = np.flatnonzero(self.usable[plan.depth])
+        rows = np.flatnonzero(self.usable)
         noise = np.empty((len(rows), self.capacity.layout.width(plan.depth)), np.uint8)
         fill(self.entropy, "lsb/noise", noise)
         for attempt in count():  # until no group of shards is too small
-            free = self.usable[plan.depth].copy()
+            free = self.usable.copy()
             headers, data_keys = self._headers(attempt, plan, [keys for keys, _ in payloads], free)
             left = np.flatnonzero(free)
             left = left[random_order(self.entropy, f"lsb/shards/{attempt}", len(left))]

@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -58,6 +58,11 @@ class Share:
     depth: int
     codewords: Codewords
 
+    def holding(self, size: int) -> Share:
+        """The same carriers with the most redundant codewords for `size` bytes."""
+        k = max(1, -(-size // (self.codewords.width * self.codewords.count)))
+        return replace(self, codewords=replace(self.codewords, k=k))
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -70,19 +75,20 @@ class Plan:
 
 @dataclass(frozen=True)
 class LowBitsCapacity:
-    """The capacity of the low bits of a model of `gaussians`, with so many `carriers` by depth."""
+    """The capacity of the low bits of a model of `gaussians`, so many of them `carriers`, at `depths`."""
 
     gaussians: int
-    carriers: Mapping[int, int]
+    carriers: int
     layout: Layout
+    depths: tuple[int, ...] = DEPTHS
 
     @staticmethod
     def of(gaussians: int, layout: Layout) -> LowBitsCapacity:
         """An estimate."""
-        return LowBitsCapacity(gaussians, dict.fromkeys(DEPTHS, int(TYPICAL_SHARE * gaussians)), layout)
+        return LowBitsCapacity(gaussians, int(TYPICAL_SHARE * gaussians), layout)
 
     def for_payloads(self) -> Capacity:
-        shares = self._sizes(self._ladder) or [(1.0, self.payload_capacity(1))]
+        shares = _sizes(self._shares) or [(1.0, self.payload_capacity(1))]
         return Capacity.of_sealed(OVERHEAD, shares, self.payload_capacity)
 
     @property
@@ -96,25 +102,27 @@ class LowBitsCapacity:
 
         Raises UsageError, with the number of Gaussians that would suffice.
         """
-        ladder = self._ladder if len(sizes) <= MAX_INDEPENDENT else []
-        if chosen := first_shares(self._sizes(ladder), sizes):
-            return self._plan([ladder[index] for index in chosen], sizes, True)
-        for depth in self.carriers:
-            equal = self._share(1 / len(sizes), self._equal(len(sizes), depth), depth)
-            if equal and equal.codewords.size >= max(sizes):
-                return self._plan([equal] * len(sizes), sizes, False)
-        raise UsageError(self.too_small(max(sizes), len(sizes)))
+        shares = self._shares if len(sizes) <= MAX_INDEPENDENT else []
+        chosen: list[Share | None] = [shares[index] for index in first_shares(_sizes(shares), sizes) or []]
+        independent = bool(chosen)
+        if not independent:
+            equal = (each for each in self._equal(len(sizes)) if each.codewords.size >= max(sizes))
+            chosen = [next(equal, None)] * len(sizes)
+        own = [share.holding(size) for share, size in zip(chosen, sizes, strict=True) if share]
+        if not own:
+            raise UsageError(self.too_small(max(sizes), len(sizes)))
+        return Plan(max(share.depth for share in own), own, independent)
 
     def payload_capacity(self, secrets: int) -> int:
         """Maximum bytes of each of `secrets` sealed payloads with equal shares; may be 0."""
-        return max(self._size(self._equal(secrets, depth), depth) for depth in self.carriers)
+        return max((share.codewords.size for share in self._equal(secrets)), default=0)
 
     def too_small(self, size: int, secrets: int) -> str:
         """The message for payloads of `size` bytes that do not fit."""
 
         def capacity(gaussians: int) -> int:
-            carriers = {d: gaussians * c // max(1, self.gaussians) for d, c in self.carriers.items()}
-            return LowBitsCapacity(gaussians, carriers, self.layout).payload_capacity(secrets)
+            carriers = gaussians * self.carriers // max(1, self.gaussians)
+            return replace(self, gaussians=gaussians, carriers=carriers).payload_capacity(secrets)
 
         need = bisect_left(range(_LONGEST * MAX_CODEWORDS), size, key=capacity)
         digits = max(0, len(str(need)) - 2)
@@ -126,64 +134,46 @@ class LowBitsCapacity:
         )
 
     @property
-    def _ladder(self) -> list[Share]:
+    def _shares(self) -> list[Share]:
         """The shares that a secret may get, in the order of capacity.
 
         Empty if the headers of four secrets would take too many carriers.
         """
-        reserved, ladder = MAX_INDEPENDENT * self.header_carriers, list[Share]()
-        for part, depth in ((0.25, LEAST), (0.5, LEAST), *((1.0, depth) for depth in self.carriers)):
-            if reserved > _MAX_RESERVED * self.carriers[depth]:
-                continue
-            share = self._share(part, int(part * (self.carriers[depth] - reserved)), depth)
-            if share and (not ladder or share.codewords.size > ladder[-1].codewords.size):
-                ladder.append(share)
-        return ladder
+        reserved, shares = MAX_INDEPENDENT * self.header_carriers, list[Share]()
+        if reserved > _MAX_RESERVED * self.carriers:
+            return []
+        for part, depth in ((0.25, LEAST), (0.5, LEAST), *((1.0, depth) for depth in self.depths)):
+            share = self._share(part, int(part * (self.carriers - reserved)), depth)
+            if share and (not shares or share.codewords.size > shares[-1].codewords.size):
+                shares.append(share)
+        return shares
 
-    @staticmethod
-    def _sizes(shares: Sequence[Share]) -> list[tuple[float, int]]:
-        return [(share.part, share.codewords.size) for share in shares]
+    def _equal(self, secrets: int) -> list[Share]:
+        """Equal shares of `secrets`, at each depth."""
+        count = self.carriers // secrets - self.header_carriers
+        shares = [self._share(1 / secrets, count, depth) for depth in self.depths]
+        return [share for share in shares if share]
 
-    def _equal(self, secrets: int, depth: int) -> int:
-        """Carriers for the shards of each of `secrets` payloads with equal shares."""
-        return max(0, self.carriers[depth] // secrets - self.header_carriers)
+    def _share(self, part: float, count: int, depth: int) -> Share | None:
+        """The share of `count` carriers at a depth, with the most data that survives.
 
-    def _plan(self, shares: Sequence[Share], sizes: Sequence[int], independent: bool) -> Plan:
-        own = [
-            self._share(share.part, share.carriers, share.depth, size)
-            for share, size in zip(shares, sizes, strict=True)
-        ]
-        return Plan(max(share.depth for share in shares), [share for share in own if share], independent)
-
-    def _size(self, count: int, depth: int) -> int:
-        """Maximum bytes of a sealed payload in `count` carriers at a depth."""
-        share = self._share(1.0, count, depth)
-        return share.codewords.size if share else 0
-
-    def _share(self, part: float, count: int, depth: int, size: int | None = None) -> Share | None:
-        """The share with the codewords of `_codewords`, if there are any."""
-        codewords = self._codewords(count, depth, size)
-        return Share(part, count, depth, codewords) if codewords else None
-
-    def _codewords(self, count: int, depth: int, size: int | None = None) -> Codewords | None:
-        """The most redundant code of `size` bytes (None: the maximum) in `count` carriers at a depth.
-
-        None if its probability of loss exceeds _FAILURE.
+        None if even the least has a probability of loss above _FAILURE.
         """
         width = self.layout.width(depth)
         shard, tagged = shard_bytes(width), is_tagged(width)
-        if count < 1 or shard < 1:
+        number = whole_groups(-(-count // _LONGEST), tagged) if count > 0 else 0
+        if shard < 1 or not 0 < number <= MAX_CODEWORDS:
             return None
-        number = whole_groups(-(-count // _LONGEST), tagged)
         groups = groups_of(number, tagged)
-        if number > MAX_CODEWORDS:
-            return None
         mean = count / groups
         n = int((mean if groups == 1 else mean - _SPREAD * mean**0.5) * groups / number)
         lost = _REMOVAL + _FALSE_COST * false_shards(self.gaussians - count, groups, tagged)
         most = _most_data(n, number, round(lost, 4))
-        k = most if size is None else max(1, -(-size // (shard * number)))
-        return Codewords(number, n, k, shard) if 0 < k <= most else None
+        return Share(part, count, depth, Codewords(number, n, most, shard)) if most else None
+
+
+def _sizes(shares: Sequence[Share]) -> list[tuple[float, int]]:
+    return [(share.part, share.codewords.size) for share in shares]
 
 
 def check_payload_fits(compressed: int, gaussians: int, secrets: int, sh_degree: int) -> None:
