@@ -1,4 +1,4 @@
-"""Capacity and cost of carrying in the codes of published files: the tables of docs/channels.md.
+"""Capacity and cost of carrying in quantised values: the tables of docs/channels.md.
 
     python benchmarks/codes.py --data FOLDER --pair bonsai=cover.ply,fox=secret.ply --write docs/channels.md
     python benchmarks/codes.py --files FOLDER --format spz bonsai=a.ply bonsai=b.ply fox=c.ply ...

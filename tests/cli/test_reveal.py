@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 import torch
 
-from channels.lsb.coded import codes_of, model_of
+from channels.lsb.quantised import codes_of, model_of
 from channels.lsb.trained_like import trained_like
 from cli.harness import PROGRAM, Result, Run, assert_refused, listing, write_key
 from keyss.channels import LOW_BITS, Payload, QuantisedCover
 from keyss.channels.colours import carriers
 from keyss.channels.container import SALTS_TRIED
-from keyss.channels.lsb import spread
+from keyss.channels.lsb import shards
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
 from keyss.keys import DerivedKey
@@ -87,7 +87,7 @@ class TestOpensNothing:
     def work(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
         """Counts of derived keys and AES blocks."""
         done = {"keys": 0, "blocks": 0}
-        encrypt, derive = spread.encrypted_blocks, DerivedKey.of
+        encrypt, derive = shards.encrypted_blocks, DerivedKey.of
 
         def counted(key: bytes, data: np.ndarray) -> np.ndarray:
             done["blocks"] += data.size // 16
@@ -97,7 +97,7 @@ class TestOpensNothing:
             done["keys"] += 1
             return derive(key, salt)
 
-        monkeypatch.setattr(spread, "encrypted_blocks", counted)
+        monkeypatch.setattr(shards, "encrypted_blocks", counted)
         monkeypatch.setattr(DerivedKey, "of", derived)
         return done
 

@@ -27,7 +27,7 @@ from cryptography.hazmat.primitives.hashes import SHA256  # noqa: E402
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
-from channels.lsb import coded  # noqa: E402
+from channels.lsb import quantised  # noqa: E402
 from channels.lsb.trained_like import trained_like  # noqa: E402
 from files.formats.examples import model_of, random_compressed, random_sog, random_spz  # noqa: E402
 from keyss.channels import LOW_BITS, SUFFIXES, Payload, channel_for, in_counted_order, last_bits, open_payload  # noqa: E402
@@ -135,8 +135,8 @@ def write_published() -> None:
 
 
 def write_coded(suffix: str) -> None:
-    """A model whose codes hold two secrets: two models, or a model and a file."""
-    cover = coded.model_of(2300, 11, 0)
+    """A model whose quantised values hold two secrets: two models, or a model and a file."""
+    cover = quantised.model_of(2300, 11, 0)
     other = {
         ".spz": Payload("carry", encode(trained_like(25, 12, 2))),
         ".sog": Payload("carry", encode(trained_like(60, 13, 0))),
@@ -150,7 +150,7 @@ def write_coded(suffix: str) -> None:
 
 def write_decoded(suffix: str) -> None:
     """A .ply decoded from codes, with a secret."""
-    codes = coded.FORMATS[suffix].of(coded.model_of(1500, 21, 0))
+    codes = quantised.FORMATS[suffix].of(quantised.model_of(1500, 21, 0))
     model = codes.dequantise()
     payload = HiddenFile("a note.txt", b"Written at night, read at noon.\n").payload()
     stego = (
@@ -180,7 +180,7 @@ def write_extremes() -> None:
 
 
 def write_counted() -> None:
-    """The carrier bits in the codes of this folder's files."""
+    """The bits of slots in the quantised values of this folder's files."""
     bits = {}
     for path in sorted([*FOLDER.glob("published*"), *FOLDER.glob("coded*"), *FOLDER.glob("extreme*")]):
         if path.suffix != ".json" and isinstance(model := read_model(path), CodedGaussians):
@@ -261,7 +261,7 @@ def write_revealed(key: str) -> None:
     opened += [open_file("pruned.ply", each) for each in TWO_KEYS]
     write_model(FOLDER / "bare.ply", bare_model())
     opened.append(open_file("bare.ply", TWO_KEYS[0]))
-    for suffix in coded.FORMATS:
+    for suffix in quantised.FORMATS:
         write_coded(suffix)
         opened += [open_file(f"coded{suffix}", each) for each in TWO_KEYS]
         write_decoded(suffix)

@@ -39,7 +39,7 @@ from .lsb.quantised import (
     QuantisedCover as QuantisedCover,
     QuantisedReader as QuantisedReader,
 )
-from .lsb.spread import Message as Message, Shards as Shards
+from .lsb.shards import Message as Message, Shards as Shards
 from .lsb.usable import (
     Carriers as Carriers,
     chance_of_bits as chance_of_bits,

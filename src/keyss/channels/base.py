@@ -90,13 +90,6 @@ class PreparedCover(Protocol):
         """
 
 
-class Reader(Protocol):
-    """Reads the secrets of a stego model from one channel."""
-
-    def open(self, key: str) -> Payload:
-        """The payload that `key` opens. Raises WrongKeyError if it opens nothing, InputError for damage."""
-
-
 class Channel(ABC):
     """A place for bits in a model."""
 

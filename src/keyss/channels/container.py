@@ -154,7 +154,7 @@ def check_of(data_key: bytes) -> bytes:
 
 
 class SaltedReader(ABC):
-    """A reader that tries a key with one salt of Argon2id after another; see `keyss.channels.base.Reader`."""
+    """Reads the secrets of a stego model: tries a key with one salt of Argon2id after another."""
 
     salts: Sequence[bytes]  # the likeliest first
 
@@ -166,9 +166,10 @@ class SaltedReader(ABC):
         """
 
     def open(self, key: str) -> Payload:
-        """See `Reader`. Changed or added Gaussians can replace the first salt, so several are tried.
+        """The payload that `key` opens. Raises WrongKeyError if it opens nothing, InputError for damage.
 
-        Each takes 0.1 s. Warns as `warned` does.
+        Changed or added Gaussians can replace the first salt, so several are tried, each in 0.1 s. Warns as
+        `warned` does.
         """
         for salt in self.salts[:SALTS_TRIED]:
             with suppress(WrongKeyError):

@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
-from keyss.channels.base import Channel, Reader
-from keyss.channels.container import Payload, warned
+from keyss.channels.base import Channel
+from keyss.channels.container import Payload, SaltedReader, warned
 from keyss.channels.foreign import copies
 from keyss.channels.names import ConvertedChannel, Format, Publish
 from keyss.core.errors import UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import CodedGaussians
+
+if TYPE_CHECKING:
+    from keyss.channels.colours.colours_channel import ColoursReader
 
 SUFFIXES = {"spz": ".spz", "sog": ".sog", "compressed-ply": ".compressed.ply"}  # of quantised formats
 
@@ -80,7 +83,7 @@ def open_payload(stego: Gaussians, key: str) -> Payload:
     raise WrongKeyError()
 
 
-def _readers(stego: Gaussians) -> Iterator[Reader | None]:
+def _readers(stego: Gaussians) -> Iterator[SaltedReader | ColoursReader | None]:
     """The readers of a model. Each channel is imported when the previous ones opened nothing."""
     from keyss.channels.lsb.decoded import Decoded
     from keyss.channels.lsb.low_bits import LowBitsReader

@@ -11,7 +11,7 @@ import pytest
 import torch
 from scipy import stats
 
-from channels.lsb.coded import FORMATS, bits_of, codes_of, written
+from channels.lsb.quantised import FORMATS, bits_of, codes_of, written
 from channels.lsb.trained_like import trained_like
 from keyss.channels import Field, QuantisedCover, in_counted_order
 from keyss.channels.lsb.fields import ROTATIONS
@@ -23,7 +23,7 @@ COUNT = 30_000
 
 @pytest.fixture(scope="module", params=FORMATS)
 def file(request: pytest.FixtureRequest) -> tuple[str, QuantisedCover, Any]:
-    """Its suffix, the cover, and the codes with something in them."""
+    """Its suffix, the cover, and its values with something in them."""
     cover = QuantisedCover.of(codes_of(request.param, COUNT))
     return request.param, cover, written(cover, b"x" * 5000)
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from channels.lsb.coded import FORMATS, codes_of, opened, written
 from channels.lsb.payloads import embed_payloads
+from channels.lsb.quantised import FORMATS, codes_of, opened, written
 from channels.lsb.trained_like import keys, trained_like
 from files.formats.examples import KINDS, random_codes
 from keyss.channels import LOW_BITS, Codewords, LowBitsReader, Parameters, Payload, QuantisedCover, container

@@ -31,7 +31,7 @@ from keyss.channels import (
 )
 from keyss.channels.container import SALTS_TRIED
 from keyss.channels.foreign import exact_foreign, exact_record
-from keyss.channels.lsb import spread
+from keyss.channels.lsb import shards
 from keyss.channels.lsb.low_bits_capacity import OVERHEAD
 from keyss.core import Gaussians, InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.files import read_model, write_model
@@ -220,14 +220,14 @@ def test_a_wrong_key_makes_the_same_work_as_a_right_one(
 ) -> None:
     """Up to the decryption of the payload: nearly as many blocks of AES; those of its shards are few."""
     blocks = 0
-    real = spread.encrypted_blocks
+    real = shards.encrypted_blocks
 
     def counted(key: bytes, data: np.ndarray) -> np.ndarray:
         nonlocal blocks
         blocks += data.size // 16
         return real(key, data)
 
-    monkeypatch.setattr(spread, "encrypted_blocks", counted)
+    monkeypatch.setattr(shards, "encrypted_blocks", counted)
     reader = LowBitsReader.of(stego)
     assert extract_derived(reader, DerivedKey.of(KEY, reader.salts[0])) == PAYLOAD
     needed, blocks = blocks, 0

@@ -1,6 +1,6 @@
 """The channel in the low bits of floats.
 
-IDs of Gaussians and a key tell where a secret lies (see `spread`), with redundancy: shuffling is harmless,
+IDs of Gaussians and a key tell where a secret lies (see `shards`), with redundancy: shuffling is harmless,
 and a quarter of the Gaussians may be lost. A file has no magic number and no index of its secrets. Carriers,
 the usable Gaussians, are chosen at random, and unused ones get noise, so the number of secrets does not show.
 
@@ -36,7 +36,7 @@ from keyss.channels.lsb.low_bits_capacity import (
     key_message,
     parameter_message,
 )
-from keyss.channels.lsb.spread import Shards, is_tagged, shard_bytes
+from keyss.channels.lsb.shards import Shards, is_tagged, shard_bytes
 from keyss.channels.lsb.usable import Carriers, repeated, salt, salt_rows
 from keyss.channels.mixing import random_order
 from keyss.channels.reed_solomon import Codewords

@@ -1,6 +1,6 @@
 """The division of carriers between secrets in low bits, and the messages of a header.
 
-A secret has a *header* of short messages (see `spread`): its data key, encrypted for each salt, and its
+A secret has a *header* of short messages (see `shards`): its data key, encrypted for each salt, and its
 parameters. Its payload is cut into shards with Reed-Solomon redundancy, one in each carrier of its share: any
 quarter of all Gaussians may be lost. The number of shards does not reveal the size of the payload.
 
@@ -25,7 +25,7 @@ from keyss.channels.base import Capacity, first_shares
 from keyss.channels.container import MAX_OVERHEAD, PARAMETER_BYTES, Parameters
 from keyss.channels.foreign import EXACT_BYTES
 from keyss.channels.lsb.bits import DEPTHS, LEAST, Layout
-from keyss.channels.lsb.spread import Message, false_shards, groups_of, is_tagged, shard_bytes, whole_groups
+from keyss.channels.lsb.shards import Message, false_shards, groups_of, is_tagged, shard_bytes, whole_groups
 from keyss.channels.lsb.usable import SALTS
 from keyss.channels.reed_solomon import LOST, Codewords
 from keyss.core.errors import InputError, UsageError

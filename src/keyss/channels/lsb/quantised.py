@@ -32,7 +32,7 @@ from keyss.channels.lsb.fields import (
     model_hash,
     with_levels,
 )
-from keyss.channels.lsb.spread import parameter_pads
+from keyss.channels.lsb.shards import parameter_pads
 from keyss.channels.lsb.usable import salt
 from keyss.channels.lsb.writable_levels import fixed_axes, writable_levels
 from keyss.channels.mixing import random_fractions, random_order, random_words

@@ -18,7 +18,7 @@ import { EXACT_BYTES, exactForeign } from '../foreign.ts';
 import type { Codewords } from '../reed_solomon.ts';
 import { DEEPEST, DEPTHS, fieldsOf, gaussianIds, ID_BYTES, LEAST, lowBits, lowWidth, saltOf, salts } from './bits.ts';
 import { BLOCK_BYTES, lastBits, type Levels, levelsOf, modelHash, readBlocks } from './fields.ts';
-import { isTagged, isWhole, message, parameterPads, shardBytes, shardsOf, type Table } from './spread.ts';
+import { isTagged, isWhole, message, parameterPads, shardBytes, shardsOf, type Table } from './shards.ts';
 
 const DATA_KEY_BYTES = 16;
 const [LEAST_BYTES, MIN_BLOCKS] = [48, 3]; // minimum bytes of a block; minimum blocks of a file

@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings, strategies as st
 
-from channels.lsb.coded import FORMATS, bits_of, codes_of, model_of, opened, there_and_back, written
+from channels.lsb.quantised import FORMATS, bits_of, codes_of, model_of, opened, there_and_back, written
 from files.formats.examples import same_codes
 from keyss.channels import (
     Field,
