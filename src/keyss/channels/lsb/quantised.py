@@ -164,12 +164,12 @@ class QuantisedCover:
         gaps = sorted(gap % (free + 1) for gap in gaps)
         for index in random_order(entropy, "lsb/along", len(payloads)).tolist():
             data_key, count = data_keys[index], counts[index]
-            header, *rows = (first + gaps.pop(0) + np.arange(count + 1, dtype=np.uint64)) % len(blocks)
+            rows = ((first + gaps.pop(0)) % len(blocks) + np.arange(count + 1)) % len(blocks)
             packed = container.Parameters(self.width, count).pack(data_key)
-            pads = parameter_pads(data_key, ids[header, None])
-            blocks[header, : len(packed)] = np.frombuffer(packed, np.uint8) ^ pads
+            pads = parameter_pads(data_key, ids[rows[:1]])
+            blocks[rows[0], : len(packed)] = np.frombuffer(packed, np.uint8) ^ pads[0]
             sealed = container.seal(data_key, payloads[index], count * self.width)
-            blocks[rows] = np.frombuffer(sealed, np.uint8).reshape(-1, self.width)
+            blocks[rows[1:]] = np.frombuffer(sealed, np.uint8).reshape(-1, self.width)
             first += count + 1
 
     def _solve(self, table: Bytes, entropy: bytes) -> Bits | None:
