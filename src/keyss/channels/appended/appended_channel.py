@@ -86,7 +86,7 @@ class Appended(Channel):
         return Capacity.of_sealed(_OVERHEAD, shares, lambda count: MAX_BYTES // count, grows=True)
 
     def appended_count(self, sizes: Sequence[int]) -> int:
-        """The number of Gaussians appended for payloads of these compressed sizes in bytes."""
+        """The number of Gaussians appended for payloads of these bytes of compressed data, at most."""
         return _padded_count([_codewords_for(size + _OVERHEAD, len(sizes)) for size in sizes])
 
 
