@@ -1,4 +1,4 @@
-"""The holder of one key, who tries all cells, sees the same whether there are other secrets or not."""
+"""The holder of one key, who tries all shards, sees the same whether there are other secrets or not."""
 
 from __future__ import annotations
 

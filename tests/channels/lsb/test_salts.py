@@ -1,4 +1,4 @@
-"""Salts that the author of a cover could know in advance have no key cells."""
+"""Salts that the author of a cover could know in advance hold no keys."""
 
 from __future__ import annotations
 
