@@ -6,7 +6,7 @@ import { InputError, tooMuchLost } from '../../core/errors.ts';
 import type { Gaussians } from '../../core/gaussians.ts';
 import { mix, type Words } from '../../core/words.ts';
 import { type Derive, expand, here, SALT_BYTES } from '../../keys/keys.ts';
-import { type Payload, type Reader, unsealed } from '../container.ts';
+import { keySecret, type Payload, type Reader, unsealed } from '../container.ts';
 import { type Carriers, carriersOf, chosen, fractions, randomPairs, saltsOf } from './carriers.ts';
 import { Fountain, NOISY } from './fountain.ts';
 
@@ -31,8 +31,8 @@ export class ColoursReader implements Reader {
   /** The payload that `key` opens, or null. Raises InputError for damage. */
   async open(key: string, derive: Derive = here): Promise<Payload | null> {
     const [first, ...others] = await Promise.all([STATIC_SALT, ...this.salts].map((salt) => derive(key, salt)));
-    const salted = others.map((each) => expand(each, 'colours/header'));
-    const secrets = { fixed: expand(first, 'colours/static'), salted };
+    const salted = others.map(keySecret);
+    const secrets = { fixed: keySecret(first), salted };
     const headers = this.alignments.map((carriers) => readHeader(secrets, carriers));
     for (const [index, header] of headers.entries()) {
       if (header === null) continue;
