@@ -122,9 +122,7 @@ def test_secret_survives_ply_to_ply(keyss: Run, files: Path, tmp_path: Path) -> 
 
 
 def test_losing_a_hidden_file_needs_force(keyss: Run, files: Path, tmp_path: Path) -> None:
-    stego = package.hide_files(
-        trained_like(2500), [package.SecretFile(b"a letter" * 20, "q7Rv2LxT9bWm4KzD")]
-    ).stego
+    stego = package.hide(trained_like(2500), [package.SecretFile(b"a letter" * 20, "q7Rv2LxT9bWm4KzD")]).stego
     write_model(tmp_path / "stego.ply", stego)
     key = ("--key-file", files / "other")
     refused = keyss("convert", tmp_path / "stego.ply", tmp_path / "out.sog", *key)

@@ -27,7 +27,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_key_sources_are_equivalent(keyss: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     text = Path("key.txt").read_text()
     assert text.endswith("\n")
-    library.hide("cover.ply", [library.Secret("small.ply", text)], width=16, out="run")
+    library.hide("cover.ply", [library.Secret("small.ply", text)], views=library.ViewOptions(16), out="run")
     assert keyss("reveal", "run/publish/model.ply", "--key-file", "key.txt", "-o", "out.ply").status == 0
     assert library.reveal("run/publish/model.ply", library.read_key("key.txt")).gaussians.sh_degree == 2
     for key, status in ((f"{KEY} ", 0), (f"{KEY}x", 3)):

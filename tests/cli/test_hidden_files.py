@@ -16,7 +16,7 @@ from cli.harness import Run, assert_refused, listing, write_key
 from keyss import read_model, write_model
 from keyss.channels import Payload
 from keyss.cli import main
-from keyss.core import InputError, UsageError
+from keyss.core import InputError, KeyssWarning, UsageError
 from keyss.methods import HiddenFile
 
 KEYS = ("q7Rv2LxT9bWm4KzD", "W2mz8Qe5TnYc6LkA")
@@ -88,7 +88,7 @@ def test_invalid_combinations(keyss: Run, folder: Path, workspace: Path, tmp_pat
     photos = ("hide", "--cover", workspace / "a", "--secret-file", folder / "empty", "-o", out)
     assert_refused(keyss(*photos, "--key-file", folder / "key0"), 2, "needs a model as the cover")
     stego, key = folder / "out" / "publish" / "model.ply", ("--key-file", folder / "key0")
-    assert_refused(keyss("reveal", stego, *key, "-o", tmp_path / "s.ply"), 4, "a file of 3,000 bytes")
+    assert_refused(keyss("reveal", stego, *key, "-o", tmp_path / "s.ply"), 2, "3,000 bytes, 'letter.pdf'")
     assert_refused(keyss("reveal", stego, *key, "-o", back, "--force"), 2, "--force")
     assert_refused(keyss("reveal", folder / "cover.ply", *key, "-o", back), 3, "opens nothing")
     assert_refused(keyss("reveal", stego, *key, "-o", stego.parent / "back"), 5, "given away")
@@ -98,16 +98,22 @@ def test_invalid_combinations(keyss: Run, folder: Path, workspace: Path, tmp_pat
 def test_names_that_are_not_text(folder: Path, tmp_path: Path) -> None:
     named = tmp_path / os.fsdecode(b"K\xfcche.pdf")
     named.write_bytes(b"plan")
-    hidden = library.hide_files(folder / "cover.ply", [library.SecretFile(named, KEYS[0])])
+    hidden = library.hide(folder / "cover.ply", [library.SecretFile(named, KEYS[0])])
     assert hidden.stego is not None
     assert library.reveal(hidden.stego, KEYS[0]).file == HiddenFile(
         "K\N{REPLACEMENT CHARACTER}che.pdf", b"plan"
     )
 
 
-def test_file_too_large(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"too small to carry .* Gaussians would do; .*channel="):
-        library.hide_files(trained_like(2000), [library.SecretFile(os.urandom(90_000), KEYS[0])])
+def test_file_too_large() -> None:
+    """It is appended, unless the model must stay unchanged."""
+    large, cover = library.SecretFile(os.urandom(90_000), KEYS[0]), trained_like(2000)
+    with pytest.raises(UsageError, match=r"too small to carry .* Gaussians would do; .publish=.converted."):
+        library.hide(cover, [large], publish="unchanged")
+    with pytest.warns(KeyssWarning, match="undetectably.*too small to carry"):
+        hidden = library.hide(cover, [large])
+    assert hidden.survives
+    assert library.reveal(hidden.stego, KEYS[0]).file.data == large.file
 
 
 def test_hidden_file_survives_conversion(keyss: Run, folder: Path, tmp_path: Path) -> None:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
 from keyss.core.errors import InputError, UsageError
+
+if TYPE_CHECKING:
+    from keyss.core import ViewOptions
 
 
 def optional(metavar: str, help: str, default: str = "", aliases: list[str] | None = None) -> Any:
@@ -63,6 +66,12 @@ class Photos:
     skip_missing: Annotated[
         bool, switch("Skip photos that are missing or damaged or have no usable camera.")
     ] = False
+
+    def views(self) -> ViewOptions:
+        """As an argument of the public functions."""
+        from keyss.core import ViewOptions
+
+        return ViewOptions(**vars(self))
 
 
 @dataclass(frozen=True, kw_only=True)

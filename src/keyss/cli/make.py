@@ -98,7 +98,7 @@ def fit(
     run(
         scene,
         config=replace(preset_for(preset, resolve_device(device).type), **training.schedule()),
-        **vars(photos),
+        views=photos.views(),
         device=device,
         out=out,
         overwrite=overwrite,

@@ -138,7 +138,7 @@ def render(
 
     with waiting(f"rendering {model.name}", seconds_for("render", model)):
         images = keyss.render(
-            model, cameras, split=split, **vars(photos), device=device, out=out, overwrite=overwrite
+            model, cameras, split=split, views=photos.views(), device=device, out=out, overwrite=overwrite
         )
     print_written(out, f"{len(images)} image{'' if len(images) == 1 else 's'}")
 

@@ -70,7 +70,7 @@ def run_demo(
             method=options.with_fit(seed=seed),
             bound=True,
             min_psnr=0,  # a quick demo writes its result, however poor
-            width=width,
+            views=keyss.ViewOptions(width),
             device=device,
             out=out,
             reporter=reporter,

@@ -22,7 +22,7 @@ def test_hide_reveal_verify_and_info(format: str, tmp_path: Path) -> None:
     cover, secrets = model_of(4000), [model_of(100, seed) for seed in (1, 2)]
     options = CarryOptions(format=format)  # type: ignore[arg-type]
     asked = [keyss.Secret(model, f"key number {i}") for i, model in enumerate(secrets)]
-    keyss.hide(cover, asked, method=options, width=32, min_psnr=0, out=tmp_path / "run")
+    keyss.hide(cover, asked, method=options, views=keyss.ViewOptions(32), min_psnr=0, out=tmp_path / "run")
     (stego,) = (tmp_path / "run" / "publish").iterdir()
     assert stego.name == f"model{SUFFIXES[format]}"
     for index, secret in enumerate(secrets):
@@ -42,7 +42,7 @@ def test_hide_reveal_verify_and_info(format: str, tmp_path: Path) -> None:
 def test_large_secrets_are_pruned(format: str) -> None:
     cover, asked = model_of(2500), [keyss.Secret(model_of(1500, 1), "key one")]
     pruning = CarryOptions(format=format, fine_tune="never")  # type: ignore[arg-type]
-    hidden = keyss.hide(cover, asked, method=pruning, width=32, min_psnr=0)
+    hidden = keyss.hide(cover, asked, method=pruning, views=keyss.ViewOptions(32), min_psnr=0)
     assert 250 < hidden.metrics.secret_gaussians[0] < 1000
 
 

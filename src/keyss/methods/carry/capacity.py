@@ -6,19 +6,19 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 from keyss.channels import APPENDED, Capacity, Channel, PreparedCover
 from keyss.channels.base import NOT_INDEPENDENT
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.methods.carry.carry_options import CarryOptions
+from keyss.fitting.config import FitConfig
 from keyss.methods.codec.precision import finest_size, prune_to_size, usual_size
 from keyss.rendering.orbit import Viewpoints
 
 _BITS_PER_GAUSSIAN = 150, 210  # of a secret that is not fitted yet, with the usual and the finest precision
 _SAMPLE, _FAR_TOO_LARGE = 10_000, 1.5  # Gaussians; times what can be appended
 _TINY = 16  # Gaussians; secrets are not pruned to fewer
-_ANY = '`publish="converted"` has room for all'
 
 
 @dataclass(frozen=True)
@@ -28,15 +28,11 @@ class SecretSize:
     count: int
     model: Gaussians | None = None  # None: not fitted yet
 
-    @staticmethod
-    def of(model: Gaussians) -> SecretSize:
-        return SecretSize(len(model), model)
-
-    @property
+    @cached_property
     def payload_bytes(self) -> tuple[int, int]:
         """Bytes of the secret as a payload, with the usual and the finest precision."""
         if self.model is None:
-            usual, finest = (self.count * each // 8 for each in _BITS_PER_GAUSSIAN)
+            usual, finest = (self.count * bits // 8 for bits in _BITS_PER_GAUSSIAN)
             return usual, finest
         return usual_size(self.model), finest_size(self.model)
 
@@ -68,18 +64,12 @@ class CarryCapacity:
     prepared: PreparedCover | None = None  # None: not fitted yet
 
     @staticmethod
-    def of(cover: Gaussians | None, options: CarryOptions) -> CarryCapacity:
-        """The capacity of `cover`. Raises UsageError for a cover without capacity."""
-        channel = options.channel_in(cover)
-        try:
-            if cover is None:
-                count, degree = options.fit.max_gaussians, options.fit.sh_degree
-                return CarryCapacity(count, degree, channel, channel.estimate_capacity(count, degree))
-            prepared = channel.prepare(cover)
-        except UsageError as error:
-            if channel.survives:
-                raise
-            raise UsageError(f"{error}; {_ANY}") from error
+    def of(channel: Channel, cover: Gaussians | None, fit: FitConfig) -> CarryCapacity:
+        """The capacity of `cover`, or of what `fit` will give. Raises UsageError if there is none."""
+        if cover is None:
+            size = fit.max_gaussians, fit.sh_degree
+            return CarryCapacity(*size, channel, channel.estimate_capacity(*size))
+        prepared = channel.prepare(cover)
         return CarryCapacity(len(cover), cover.sh_degree, channel, prepared.capacity, prepared)
 
     def sizes(self, secrets: Sequence[SecretSize]) -> list[int]:
@@ -95,8 +85,7 @@ class CarryCapacity:
         if any(count < min(_TINY, secret.count) for count, secret in zip(counts, secrets, strict=True)):
             raise UsageError(
                 f"a cover of {self.gaussians:,} Gaussians is too small to hide {len(secrets)} "
-                f"{'secrets' if len(secrets) > 1 else 'secret'} in its {self.channel.place}; "
-                + ('`channel="appended"` has room for all' if self.channel.survives else _ANY)
+                f"{'secrets' if len(secrets) > 1 else 'secret'} in its {self.channel.place}"
             )
         return counts
 
@@ -108,7 +97,7 @@ class CarryCapacity:
         needed = list(map(finest_size, models))
         warn_of_sharing(self.payloads, needed)
         limits = shares(self.payloads, needed)
-        return [prune_to_size(*each) for each in zip(models, limits, viewpoints, strict=True)]
+        return [prune_to_size(*model) for model in zip(models, limits, viewpoints, strict=True)]
 
     def appended(self, secrets: Sequence[SecretSize]) -> int:
         """Approximate number of Gaussians by which the model grows."""
