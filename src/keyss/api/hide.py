@@ -83,10 +83,11 @@ def hide(
     for measurements. Plain models of scenes are fitted unless they are given. `method`: a name, with the
     default preset of the device, or the options of a method (`CarryOptions`, `KeyssOptions`).
 
-    `publish="unchanged"` is for a file that must stay as it is: secrets go undetected in low bits of a .ply,
-    or in the integers of a quantised format. By default `publish` becomes "converted", with a warning, if
-    that is not possible: the file may be converted later, and shows that it holds something. The options'
-    `format` and `channel` select further.
+    `publish="unchanged"` is for a file that must stay as it is: secrets go into low bits of a .ply, or of the
+    integers of a quantised format (the options' `format`). `publish="converted"` is for one that may be
+    converted: secrets go into the options' `channel`, and inspection finds them. The default is "unchanged"
+    or, with a warning, "converted" if neither `publish` nor `format` is given and the cover has too little
+    capacity. `publish` replaces that of the options.
 
     `out` (a folder) gets `publish/` with the stego model, and `private/` with fitted models, `config.json`,
     `metrics.json`, `look.png` (test views of cover and secrets before and after), companion files for methods

@@ -97,9 +97,9 @@ class HideArguments:
         Literal["unchanged", "converted"] | None,
         optional(
             "{unchanged,converted}",
-            "unchanged: a file that must stay as it is, in which the secret cannot be detected. converted: a "
-            ".ply that may be converted later; inspection shows that it holds something.",
-            "unchanged or, with a warning, converted if the cover has too little room",
+            "unchanged: a file that must stay as it is; the secret lies in its low bits. converted: a .ply that "
+            "may be converted later; inspection shows that it holds something.",
+            "unchanged or, with a warning, converted if the cover has too little capacity",
         ),
     ] = None
     format: Annotated[
