@@ -7,6 +7,7 @@ from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
+from types import FunctionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from tyro.conf import OmitArgPrefixes, UseAppendAction, arg
@@ -97,7 +98,7 @@ class HideArguments:
         Literal["unchanged", "converted"] | None,
         optional(
             "{unchanged,converted}",
-            "unchanged: a file that must stay as it is; the secret lies in its low bits. converted: a .ply that "
+            "unchanged: a file that must stay as it is; the secret lies in low bits. converted: a .ply that "
             "may be converted later; inspection shows that it holds something.",
             "unchanged or, with a warning, converted if the cover has too little capacity",
         ),
@@ -311,11 +312,9 @@ def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
     ]
     kind = make_dataclass("Arguments", changed, bases=(HideArguments,), frozen=True, kw_only=True)
 
-    def command(args: HideArguments) -> None:
-        hide(args)
-
+    command = FunctionType(hide.__code__, hide.__globals__, "hide")  # `hide` with other annotations
     command.__annotations__ = {"args": Annotated[kind, arg(name="")], "return": None}
-    command.__name__, command.__doc__ = "hide", hide.__doc__
+    command.__doc__ = hide.__doc__
     return command
 
 

@@ -6,7 +6,6 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 from keyss.channels import APPENDED, Capacity, Channel, PreparedCover
 from keyss.channels.base import NOT_INDEPENDENT
@@ -25,32 +24,35 @@ _TINY = 16  # Gaussians; secrets are not pruned to fewer
 class SecretSize:
     """The size of a secret, at most if it is not fitted yet."""
 
-    count: int
-    model: Gaussians | None = None  # None: not fitted yet
+    count: int  # Gaussians
+    usual: int  # bytes of its payload with the usual precision
+    finest: int
+    fitted: bool
 
-    @cached_property
-    def payload_bytes(self) -> tuple[int, int]:
-        """Bytes of the secret as a payload, with the usual and the finest precision."""
-        if self.model is None:
-            usual, finest = (self.count * bits // 8 for bits in _BITS_PER_GAUSSIAN)
-            return usual, finest
-        return usual_size(self.model), finest_size(self.model)
+    @staticmethod
+    def of(model: Gaussians | None, fit: FitConfig) -> SecretSize:
+        """The size of `model`, or of what `fit` will give."""
+        if model is not None:
+            return SecretSize(len(model), usual_size(model), finest_size(model), True)
+        usual, finest = (fit.max_gaussians * bits // 8 for bits in _BITS_PER_GAUSSIAN)
+        return SecretSize(fit.max_gaussians, usual, finest, False)
 
-    def check_appended(self) -> None:
-        """Raise UsageError for a secret far too large for appended Gaussians, by a sample of it.
 
-        A sparse sample takes more bits for positions: log2 of the distance between its Gaussians.
-        """
-        step, most = self.count // _SAMPLE, APPENDED.estimate_capacity(0, 0).bytes
-        if self.model is None or step < 2:
-            return
-        sample = self.model[::step]
-        size = self.count * (usual_size(sample) / len(sample) - math.log2(step) / 8)
-        if size > _FAR_TOO_LARGE * most:
-            raise UsageError(
-                f"the secret takes about {size:,.0f} bytes, and {most:,} can be "
-                "appended; fewer Gaussians or a lower SH degree take less"
-            )
+def check_appended(model: Gaussians) -> None:
+    """Raise UsageError for a secret far too large for appended Gaussians, by a sample of it.
+
+    A sparse sample takes more bits for positions: log2 of the distance between its Gaussians.
+    """
+    step, most = len(model) // _SAMPLE, APPENDED.estimate_capacity(0, 0).bytes
+    if step < 2:
+        return
+    sample = model[::step]
+    size = len(model) * (usual_size(sample) / len(sample) - math.log2(step) / 8)
+    if size > _FAR_TOO_LARGE * most:
+        raise UsageError(
+            f"the secret takes about {size:,.0f} bytes, and {most:,} can be "
+            "appended; fewer Gaussians or a lower SH degree take less"
+        )
 
 
 @dataclass(frozen=True)
@@ -77,9 +79,9 @@ class CarryCapacity:
 
         Raises UsageError if the cover is too small.
         """
-        limits = shares(self.payloads, [secret.payload_bytes[1] for secret in secrets])
+        limits = shares(self.payloads, [secret.finest for secret in secrets])
         counts = [
-            min(secret.count, secret.count * limit // secret.payload_bytes[0])
+            min(secret.count, secret.count * limit // secret.usual)
             for secret, limit in zip(secrets, limits, strict=True)
         ]
         if any(count < min(_TINY, secret.count) for count, secret in zip(counts, secrets, strict=True)):
@@ -103,7 +105,7 @@ class CarryCapacity:
         """Approximate number of Gaussians by which the model grows."""
         if not self.payloads.grows:
             return 0
-        return APPENDED.appended_count([secret.payload_bytes[0] for secret in secrets])
+        return APPENDED.appended_count([secret.usual for secret in secrets])
 
 
 def shares(capacity: Capacity, needed: Sequence[int]) -> list[int]:

@@ -14,7 +14,7 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.schedule import boost_of
-from keyss.methods.carry.capacity import CarryCapacity, SecretSize, shares, warn_of_sharing
+from keyss.methods.carry.capacity import CarryCapacity, SecretSize, check_appended, shares, warn_of_sharing
 from keyss.methods.carry.carried_secret import CarriedSecret
 from keyss.methods.carry.carry_options import FINE_TUNING, CarryOptions
 from keyss.methods.codec.precision import encode_to_size, finest_size
@@ -52,24 +52,20 @@ class CarryMethod:
     ) -> Prepared:
         """Select the channel, and the secrets that are pruned and fine-tuned; see `Method`."""
         cover, *secrets = sources
-        secret_sizes = [
-            SecretSize(len(secret.given), secret.given)
-            if secret.given
-            else SecretSize(options.fit.max_gaussians)
-            for secret in secrets
-        ]
+        chosen = replace(options, publish="converted") if earlier and earlier.grows else options
+        if chosen.publish == "converted" and chosen.channel == "appended":
+            for secret in secrets:
+                if secret.given is not None:
+                    check_appended(secret.given)
+        secret_sizes = [SecretSize.of(secret.given, options.fit) for secret in secrets]
 
         def fit_in(channel: Channel) -> tuple[CarryCapacity, list[int]]:
-            if channel.grows:
-                for secret in secret_sizes:
-                    secret.check_appended()
             capacity = CarryCapacity.of(channel, cover.given, options.fit)
             counts = capacity.sizes(secret_sizes)
             if not (options.publish or options.format) and cover.given is not None:
                 _check_share(secret_sizes, counts)
             return capacity, counts
 
-        chosen = replace(options, publish="converted") if earlier and earlier.grows else options
         capacity, counts = chosen.in_channel(cover.given, fit_in)
         steps = _fine_tuning_steps(secrets, secret_sizes, counts, options)
         training = (Training(), *map(Training, steps))
@@ -154,7 +150,7 @@ def _fine_tuning_steps(
 def _check_share(secrets: Sequence[SecretSize], counts: Sequence[int]) -> None:
     """Raise UsageError for given secrets that would keep less than _MIN_SHARE of their Gaussians."""
     for secret, count in zip(secrets, counts, strict=True):
-        if secret.model is not None and count < _MIN_SHARE * secret.count:
+        if secret.fitted and count < _MIN_SHARE * secret.count:
             raise UsageError(f"a secret of {secret.count:,} Gaussians would be cut down to {count:,}")
 
 
@@ -228,14 +224,18 @@ def embed_models(
         for model, limit, views in zip(models, limits, viewpoints, strict=True)
     ]
     stego = cover.embed(list(zip(keys, payloads, strict=True)), entropy=entropy)
-    opened = [CarriedSecret.of(open_payload(stego, key)) for key in keys]
-    if [len(each.gaussians) for each in opened] != list(map(len, models)):
-        raise RuntimeError("the embedded secrets do not open again as they should")
-    sizes = [len(each.data) for each in payloads]
+    opened = []
+    for key, model in zip(keys, models, strict=True):
+        opened.append(CarriedSecret.of(open_payload(stego, key)))
+        if len(opened[-1].gaussians) != len(model):
+            raise RuntimeError("the embedded secrets do not open again as they should")
+    sizes = [len(payload.data) for payload in payloads]
     details: dict[str, Any] = {
         "secret_bytes": sizes,
-        "sh_degrees": [each.sh_degree for each in models],
-        "bits_per_gaussian": [round(8 * size / len(each)) for size, each in zip(sizes, models, strict=True)],
+        "sh_degrees": [model.sh_degree for model in models],
+        "bits_per_gaussian": [
+            round(8 * size / len(model)) for size, model in zip(sizes, models, strict=True)
+        ],
     }
     if not capacity.grows:
         details["capacity_bytes"] = capacity.bytes
