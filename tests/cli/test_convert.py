@@ -167,7 +167,7 @@ def test_training_folder_as_model(keyss: Run, tmp_path: Path) -> None:
     assert len(read_model(tmp_path / "a.spz")) == COUNT + 3000
 
 
-def test_low_bits_beside_appended_gaussians_must_not_be_converted(
+def test_converting_low_bits_beside_appended_gaussians_is_refused(
     keyss: Run, files: Path, tmp_path: Path
 ) -> None:
     write_model(tmp_path / "cover.ply", trained_like(1500))

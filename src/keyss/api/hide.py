@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ from keyss.measure.renders import sheet_of
 from keyss.methods.companion import pack
 from keyss.methods.hidden import HiddenScene
 from keyss.methods.method import Context, Method, MethodOptions, Prepared, Source, Stego, role_of
-from keyss.methods.plain_models import Bound, fit_bounds, fit_plain_models
+from keyss.methods.plain_models import fit_bounds, fit_plain_models
 from keyss.methods.registry import DEFAULT, open_companion, open_model
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
@@ -112,8 +113,7 @@ def hide(
     check_arguments(out, min_psnr)
     place = None if out is None else Path(out)
     if files := [secret for secret in secrets if isinstance(secret, SecretFile)]:
-        for_scenes = {"cover_model": cover_model, "bound": bound, "min_psnr": min_psnr, "resume": resume}
-        check_not_given(for_scenes)
+        check_not_given(cover_model=cover_model, bound=bound, min_psnr=min_psnr, resume=resume)
         return hide_files(cover, files, options, place, overwrite, dry_run, reporter)
     given = Given.of(cover, cover_model, [secret for secret in secrets if isinstance(secret, Secret)])
     options = replace(options, fit=with_seed(options.fit, place if resume else None, "options", "fit"))
@@ -134,8 +134,10 @@ def hide(
         return HideResult(plan=prepared.plan, cost=cost)
     with folder.work() if folder else nullcontext():
         if not resume and (prepared.grows or trains):
-            reporter.note(f"hide: a file of up to {prepared.plan.megabytes:,.1f} MB, {cost}")
-            for note in prepared.plan.notes:
+            for note in (
+                f"hide: a file of up to {prepared.plan.megabytes:,.1f} MB, {cost}",
+                *prepared.plan.notes,
+            ):
                 reporter.note(note)
         context = Context(target, folder.checkpoints if folder and trains else None, resume, reporter)
         if any(source.given is None for source in sources):
@@ -143,31 +145,25 @@ def hide(
             prepared = chosen.prepare(sources, options, prepared)
         context = replace(context, entropy=_entropy(given.keys, prepared.options, sources))
         stego = chosen.hide(sources, prepared, context)
-        plain = [
-            PlainModel(len(source.model), source.model.sh_degree, steps, Bound.of(training, steps))
-            for source, training, steps in zip(sources, prepared.training, plain_steps, strict=True)
-        ]
+        plain = list(map(PlainModel.of, sources, prepared.training, plain_steps))
         results: dict[str, Any] = {**given.models_to_write(sources)}
-        shape = cover if cover_model is None else cover_model
-        published = with_extras(stego.gaussians, shape, sources[0].model)
+        published = with_extras(
+            stego.gaussians, cover if cover_model is None else cover_model, sources[0].model
+        )
         # Images of given models take their place from here on, which frees memory for the revealed ones.
         prepared = replace(prepared, carrier=None)
         sources = [source if source.photos else replace(source, given=None) for source in sources]
         with reporter.waiting("reading the published file, and comparing renders", cost.check_seconds):
             models = _write_and_read(stego, published, given.keys, folder)
-            shown = [
-                compare_with(source, model, target) for source, model in zip(sources, models, strict=True)
-            ]
+            shown = list(map(partial(compare_with, target), sources, models))
         check_quality(shown, min_psnr, models, plain, prepared, resumes=trains)
         longer = _fit_bounds(plain, sources, models, prepared, context) if bound else {}
         metrics = hide_metrics(stego, models, sources, shown, plain, longer, prepared, target)
         metrics = replace(metrics, seconds=round(time.monotonic() - began, 1))
         if folder:
-            names = bound_names(len(secrets))
-            results |= {names[index]: model for index, model in longer.items()}
+            results |= {bound_names(len(secrets))[index]: model for index, model in longer.items()}
             settings = replace(settings, payloads=secret_ids(metrics.seed, stego.opened))
-            look = _look(models, sources, target)
-            folder.write({**results, CONFIG: settings, METRICS: metrics, LOOK: look})
+            folder.write(results | {CONFIG: settings, METRICS: metrics, LOOK: _look(models, sources, target)})
     return HideResult(stego.gaussians, metrics, survives=prepared.survives)
 
 

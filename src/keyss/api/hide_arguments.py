@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import combinations
@@ -102,7 +102,7 @@ def check_arguments(out: PathLike | None, min_psnr: float | None) -> None:
         raise UsageError(f"`min_psnr`: expected a number of dB, got {min_psnr}")
 
 
-def check_not_given(for_scenes: Mapping[str, object]) -> None:
+def check_not_given(**for_scenes: object) -> None:
     """Raise UsageError for an argument that hidden files do not use."""
     for name, value in for_scenes.items():
         if value not in (None, False):

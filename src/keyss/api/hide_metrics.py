@@ -10,7 +10,7 @@ import torch
 from keyss.core.gaussians import Gaussians
 from keyss.fitting.image_metrics import quality
 from keyss.measure.hide_quality import BaselineQuality, Shown, compare, measure_hiding
-from keyss.methods.method import Prepared, Source, Stego
+from keyss.methods.method import Prepared, Source, Stego, Training
 from keyss.methods.plain_models import Bound
 from keyss.runs.run_records import HideMetrics
 
@@ -24,8 +24,12 @@ class PlainModel:
     steps: int | None  # training steps; None: the model was given, unknown
     bound: Bound  # the upper bound of its scene
 
+    @staticmethod
+    def of(source: Source, training: Training, steps: int | None) -> PlainModel:
+        return PlainModel(len(source.model), source.model.sh_degree, steps, Bound.of(training, steps))
 
-def compare_with(source: Source, model: Gaussians, device: torch.device) -> Shown:
+
+def compare_with(device: torch.device, source: Source, model: Gaussians) -> Shown:
     """Compare a model with the test views of its scene, and with its plain model or renders of it."""
     plain = source.given.to(device) if source.given is not None else None
     return compare(model.to(device), plain, source.scene, of_plain=not source.photos)

@@ -106,6 +106,6 @@ def verify(
             except WrongKeyError as error:
                 which = f"key {number} of {len(given)}: " if len(given) > 1 else ""
                 raise WrongKeyError(f"{which}{error}") from error
-        problems = [str(each.message) for each in caught if issubclass(each.category, KeyssWarning)]
+        problems = [str(warning.message) for warning in caught if issubclass(warning.category, KeyssWarning)]
         secrets.append(check_secret(revealed, problems))
     return Verification(name, check_model(gaussians), tuple(secrets))

@@ -93,12 +93,12 @@ PHOTOS, TRAINING = Photos(), Training()
 def changed_flags(options: Any) -> list[str]:
     """Flags whose options, also in groups, differ from their defaults."""
     flags = []
-    for each in fields(options):
-        value = getattr(options, each.name)
+    for field in fields(options):
+        value = getattr(options, field.name)
         if is_dataclass(value):
             flags += changed_flags(value)
-        elif value != each.default:
-            flags.append(flag(each.name))
+        elif value != field.default:
+            flags.append(flag(field.name))
     return flags
 
 

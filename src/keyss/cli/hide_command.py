@@ -228,8 +228,8 @@ def _secrets(args: HideArguments) -> list[Secret] | list[SecretFile]:
     from keyss.methods import registry
 
     if args.secret_file:
-        found = keys(args.key_file, len(args.secret_file), new=True)
-        return list(map(SecretFile, args.secret_file, found))
+        given = keys(args.key_file, len(args.secret_file), new=True)
+        return list(map(SecretFile, args.secret_file, given))
     count, models = len(args.secret), args.details.secret_model
     for path in args.secret:
         if path.is_file() and not is_model_path(path):
@@ -242,8 +242,8 @@ def _secrets(args: HideArguments) -> list[Secret] | list[SecretFile]:
             f"expected no --secret-model or one for each of {count} secret(s), got {len(models)}"
         )
     has_keys = registry.get(args.method).capabilities.keys or args.key_file
-    found = keys(args.key_file, count, new=True) if has_keys else [""] * count
-    return list(map(Secret, args.secret, found, models or (None,) * count))
+    given = keys(args.key_file, count, new=True) if has_keys else [""] * count
+    return list(map(Secret, args.secret, given, models or (None,) * count))
 
 
 def _ignored_training_flags(args: HideArguments) -> str:
@@ -293,22 +293,22 @@ def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
     chooser.add_argument("--method", nargs="?")
     asked = chooser.parse_known_args(arguments)[0].method
     name = asked if asked in registry.METHODS else registry.DEFAULT
-    flags = {each: set(map(flag, own_options(each))) for each in registry.METHODS}
+    flags = {method: set(map(flag, own_options(method))) for method in registry.METHODS}
     for argument in arguments:
         given = argument.partition("=")[0].replace("_", "-")
-        having = [each for each in flags if given in flags[each]]
+        having = [method for method in flags if given in flags[method]]
         if having and name not in having:
             known = ", ".join(sorted(flags[name])) or "none"
             raise UsageError(
                 f"{given} is an option of --method {' and '.join(having)}; --method {name} has: {known}"
             )
-    summaries = "; ".join(f"{each}: {modules.summary}" for each, modules in registry.METHODS.items())
+    summaries = "; ".join(f"{method}: {modules.summary}" for method, modules in registry.METHODS.items())
     methods: Any = Annotated[Literal[tuple(registry.METHODS)], arg(help=f"{summaries}.")]
-    own = make_dataclass("Own", map(_own_field, own_options(name).items()), frozen=True, kw_only=True)
-    own.__doc__ = f"Options that only the method {name} has."
+    options = make_dataclass("Own", map(_own_field, own_options(name).items()), frozen=True, kw_only=True)
+    options.__doc__ = f"Options that only the method {name} has."
     changed: list[tuple[str, Any, Any]] = [
         ("method", methods, field(default=name)),
-        ("own", Annotated[own, arg(name=name), OmitArgPrefixes], field(default=own())),
+        ("own", Annotated[options, arg(name=name), OmitArgPrefixes], field(default=options())),
     ]
     kind = make_dataclass("Arguments", changed, bases=(HideArguments,), frozen=True, kw_only=True)
 
@@ -335,8 +335,11 @@ def own_options(method: str) -> dict[str, tuple[Any, CommandLineOption]]:
     options = options_of(method)
     hints = get_type_hints(options, include_extras=True)
     return {
-        each.name: (get_args(hints[each.name])[0], replace(extra, default=extra.default or str(each.default)))
-        for each in fields(options)
-        for extra in getattr(hints[each.name], "__metadata__", ())
+        field.name: (
+            get_args(hints[field.name])[0],
+            replace(extra, default=extra.default or str(field.default)),
+        )
+        for field in fields(options)
+        for extra in getattr(hints[field.name], "__metadata__", ())
         if isinstance(extra, CommandLineOption)
     }

@@ -192,7 +192,7 @@ def convert(
 
     given = given_keys(key_file)
     with waiting(f"converting {model.name}", seconds_to_convert(model, out, len(given))):
-        found = keyss.convert(
+        conversion = keyss.convert(
             model,
             out,
             given,
@@ -201,4 +201,4 @@ def convert(
             overwrite=overwrite,
             device=device,
         )
-    print_conversion(out, found, dry_run=dry_run)
+    print_conversion(out, conversion, dry_run=dry_run)

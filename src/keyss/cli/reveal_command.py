@@ -104,7 +104,7 @@ def verify(
 
     given = given_keys(key_file)
     with waiting(f"checking {model.name}", seconds_for("reveal" if given else "verify", model)):
-        found = keyss.verify(model, given, device=device)
-    (print_json if json_ else print_verification)(found)
-    if found.problems:
-        raise InputError(f"{model}: {'; '.join(found.problems)}")
+        checked = keyss.verify(model, given, device=device)
+    (print_json if json_ else print_verification)(checked)
+    if checked.problems:
+        raise InputError(f"{model}: {'; '.join(checked.problems)}")

@@ -166,8 +166,8 @@ def info(
     from keyss.runs.estimates import seconds_for
 
     with waiting(f"reading {path.name}", seconds_for("info", path)):
-        found = describe(path, capacity=capacity)
-    (print_json if json_ else print_info)(found)
+        described = describe(path, capacity=capacity)
+    (print_json if json_ else print_info)(described)
 
 
 def evaluate(

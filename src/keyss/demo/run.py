@@ -153,5 +153,5 @@ def _comparison(
     }
     pictures = zip(*columns.values(), strict=True)
     return contact_sheet(
-        list(columns), {f"view {row}": each for row, each in zip(rows, pictures, strict=True)}
+        list(columns), {f"view {row}": images for row, images in zip(rows, pictures, strict=True)}
     )

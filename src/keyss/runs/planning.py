@@ -123,7 +123,7 @@ def check_room(cost: Cost, out: Path | None) -> None:
     """Raise OutputError if the disk of `out` lacks space for all files; warn if memory is short."""
     if out is not None:
         real = Path(os.path.realpath(out))  # need not exist
-        free = shutil.disk_usage(next(each for each in (real, *real.parents) if each.exists())).free
+        free = shutil.disk_usage(next(folder for folder in (real, *real.parents) if folder.exists())).free
         if free < cost.disk_bytes:
             raise OutputError(
                 f"{out}: expected {cost.disk_bytes / 1e6:,.0f} MB of free space for models and checkpoints, "

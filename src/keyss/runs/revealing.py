@@ -1,4 +1,4 @@
-"""Reveal the secret of a key in a published model, and check both: soundness, and the share that is left."""
+"""Open a secret; check the model and how much of the secret survived."""
 
 from __future__ import annotations
 

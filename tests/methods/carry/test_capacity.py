@@ -74,7 +74,7 @@ def test_shares_fit(gaussians: int, secrets: int) -> None:
             cells.plan([compressed_size(random.bytes(limit)) + OVERHEAD for limit in limits])
 
 
-def test_a_secret_that_is_pruned_for_others_is_not_hidden_silently() -> None:
+def test_pruning_for_other_secrets_warns() -> None:
     """Alone it would stay whole; pruned to a third, its payload fits into a half."""
     cover, models = trained_like(4000), [trained_like(count, 1, 1) for count in (4000, 200, 200)]
     capacity = CarryCapacity.of(LOW_BITS, cover, FitConfig())

@@ -67,7 +67,7 @@ def test_fine_tuning_steps() -> None:
     assert (len(keyss.reveal(result.stego, KEY).gaussians),) == result.metrics.secret_gaussians
 
 
-def test_secrets_that_share_the_capacity_are_noticed() -> None:
+def test_shared_capacity_warns() -> None:
     cover, large = trained_like(2500), [trained_like(2000, seed) for seed in (1, 2)]
     secrets = [Secret(model, f"{KEY} {number}") for number, model in enumerate(large)]
     with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):

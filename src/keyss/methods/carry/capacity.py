@@ -119,7 +119,7 @@ def shares(capacity: Capacity, needed: Sequence[int]) -> list[int]:
     total = int(capacity.bytes * capacity.further ** (count - 1))
     steps = capacity.steps or [(1 / part, total // part) for part in (4, 2, 1)]
     chosen = [
-        next((each for each in steps if size <= each[1] - capacity.overhead), steps[-1]) for size in needed
+        next((step for step in steps if size <= step[1] - capacity.overhead), steps[-1]) for size in needed
     ]
     limits = [limit for _, limit in chosen]
     if count > 1 and (capacity.grows or not capacity.divisible or sum(part for part, _ in chosen) > 1):

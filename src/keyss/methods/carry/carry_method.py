@@ -73,8 +73,10 @@ class CarryMethod:
             pairs = zip(earlier.training, training, strict=True)
             training = tuple(old if old.steps else new for old, new in pairs)
         fits = [
-            options.fit if index == 0 or own.steps else unpruned
-            for index, (own, unpruned) in enumerate(zip(training, options.fits(len(sources)), strict=True))
+            options.fit if index == 0 or trained.steps else unpruned
+            for index, (trained, unpruned) in enumerate(
+                zip(training, options.fits(len(sources)), strict=True)
+            )
         ]
         appended = capacity.appended(secret_sizes)
         plan = Plan(
@@ -131,7 +133,7 @@ class CarryMethod:
                 entropy=context.entropy,
             )
         details = {"gaussians_before_pruning": [len(model) for model in plain], **stego.details}
-        return replace(stego, iterations=max(own.steps for own in prepared.training), details=details)
+        return replace(stego, iterations=max(trained.steps for trained in prepared.training), details=details)
 
 
 def _fine_tuning_steps(
