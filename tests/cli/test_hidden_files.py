@@ -31,7 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (made / "empty").write_bytes(b"")
     for index, key in enumerate(KEYS):
         write_key(made / f"key{index}", key)
-    assert main([str(each) for each in _arguments(made, made / "out")]) == 0
+    assert main([str(argument) for argument in _arguments(made, made / "out")]) == 0
     return made
 
 
@@ -135,7 +135,7 @@ def test_hidden_file_survives_conversion(keyss: Run, folder: Path, tmp_path: Pat
 @given(st.binary(max_size=300))
 def test_foreign_payloads(data: bytes) -> None:
     try:
-        found = HiddenFile.of(Payload("file", data))
+        file = HiddenFile.of(Payload("file", data))
     except InputError:
         return
-    assert len(found.data) <= len(data)
+    assert len(file.data) <= len(data)

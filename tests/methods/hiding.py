@@ -42,7 +42,8 @@ def hide_scenes(
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*appended", KeyssWarning)
         sources = [
-            Source(model, True, *each) for model, *each in zip(given, ("", *keys), scenes, strict=True)
+            Source(model, True, key, scene)
+            for model, key, scene in zip(given, ("", *keys), scenes, strict=True)
         ]
         prepared = method.prepare(sources, options)
         context = Context(torch.device("cpu"), checkpoints, resume, reporter, entropy=bytes(32))

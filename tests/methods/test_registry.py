@@ -75,7 +75,7 @@ class WholeMethod:
     def hide(self, sources: Sequence[Source], prepared: Prepared, context: Context) -> Stego:
         cover, secret = sources
         model = secret.model
-        columns = [getattr(model, each.name) for each in fields(Gaussians)]
+        columns = [getattr(model, field.name) for field in fields(Gaussians)]
         rows = torch.cat([column.reshape(len(model), -1) for column in columns], dim=1)
         payload = Payload("whole", rows.numpy().tobytes())
         stego = LOW_BITS.prepare(cover.model).embed([(secret.key, payload)])

@@ -39,9 +39,9 @@ def _source(model: Gaussians, photos: bool = False) -> Source:
 
 def test_no_fine_tuning_when_secret_fits() -> None:
     cover, secret = trained_like(2500), trained_like(900, 1, 2)
-    found = _prepare(CarryOptions(), _source(cover), _source(secret))
-    assert found.training == (Training(), Training())
-    assert not found.trains
+    prepared = _prepare(CarryOptions(), _source(cover), _source(secret))
+    assert prepared.training == (Training(), Training())
+    assert not prepared.trains
     result = keyss.hide(cover, [Secret(secret, KEY)], views=keyss.ViewOptions(24))
     assert result.metrics.iterations == 0
     revealed = keyss.reveal(result.stego, KEY).gaussians
@@ -87,9 +87,9 @@ def test_fine_tuning_option() -> None:
 @pytest.mark.parametrize(("format", "secrets"), [("ply", 3), ("spz", 1)])
 def test_fine_tuning_from_photos(format: str, secrets: int) -> None:
     options = CarryOptions(fit=FIT, format=format)  # type: ignore[arg-type]
-    found = _prepare(options, *[PHOTOS] * (1 + secrets))
-    assert [fit.iterations for fit in found.fits] == [1000] * (1 + secrets)
-    assert found.training == (Training(), *[Training(1150)] * secrets)
+    prepared = _prepare(options, *[PHOTOS] * (1 + secrets))
+    assert [fit.iterations for fit in prepared.fits] == [1000] * (1 + secrets)
+    assert prepared.training == (Training(), *[Training(1150)] * secrets)
 
 
 def test_most_contributing() -> None:

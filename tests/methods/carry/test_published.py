@@ -26,10 +26,10 @@ def test_hide_reveal_verify_and_info(format: str, tmp_path: Path) -> None:
     (stego,) = (tmp_path / "run" / "publish").iterdir()
     assert stego.name == f"model{SUFFIXES[format]}"
     for index, secret in enumerate(secrets):
-        found = keyss.reveal(stego, f"key number {index}").gaussians
-        assert len(found) == 100
+        revealed = keyss.reveal(stego, f"key number {index}").gaussians
+        assert len(revealed) == 100
         # Packing sorts them.
-        nearest = torch.cdist(found.means, secret.means).min(dim=1).values
+        nearest = torch.cdist(revealed.means, secret.means).min(dim=1).values
         assert float(nearest.max()) < 0.01
         assert keyss.verify(stego, f"key number {index}").secrets
     with pytest.raises(keyss.WrongKeyError):

@@ -10,7 +10,7 @@ from keyss.lab.baselines.baseline import Baseline, CompanionTensors, Show
 from keyss.lab.baselines.baseline_options import BaselineOptions, BoundOptions
 from keyss.methods.method import Capabilities, Context, Plan, Prepared, Source, Stego
 
-_NAMES = tuple(each.name for each in fields(Gaussians))
+_NAMES = tuple(field.name for field in fields(Gaussians))
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,9 @@ class BoundMethod(Baseline):
     ) -> Prepared:
         """Both models, unchanged."""
         fit = options.fit
-        cover, secret = (fit.max_gaussians if each.given is None else len(each.given) for each in sources)
+        cover, secret = (
+            fit.max_gaussians if source.given is None else len(source.given) for source in sources
+        )
         degree = fit.sh_degree if sources[0].given is None else sources[0].given.sh_degree
         plan = Plan(gaussians=cover, sh_degree=degree, secret_gaussians=secret, capacity=secret)
         return Prepared.of(options, len(sources), plan)
