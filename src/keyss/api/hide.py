@@ -24,9 +24,8 @@ from keyss.api.hide_arguments import (
     check_not_given,
     method_for,
 )
-from keyss.api.hide_checks import check_quality
 from keyss.api.hide_files import hide_files
-from keyss.api.hide_metrics import PlainModel, compare_with, hide_metrics
+from keyss.api.hide_metrics import PlainModel, check_quality, compare_with, hide_metrics
 from keyss.channels import Publish
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, ViewOptions

@@ -32,6 +32,10 @@ KeyFiles = Annotated[
     UseAppendAction[tuple[Path, ...]],
     optional("FILE", "Key file, one for each secret; - for stdin.", "KEYSS_KEY or a prompt"),
 ]
+KeyFilesToCheck = Annotated[
+    UseAppendAction[tuple[Path, ...]],
+    optional("FILE", "Key file of a secret to check; repeat for more.", "KEYSS_KEY, else no key"),
+]
 Preset = Annotated[
     Literal["quick", "default", "full"],
     arg(
@@ -119,3 +123,12 @@ def check_seed(seed: int) -> int:
     if not 0 <= seed < 1 << 32:
         raise UsageError(f"--seed: expected 0 to {(1 << 32) - 1}, got {seed}")
     return seed
+
+
+def verb(name: str) -> Any:
+    """The function `name` of `keyss`; a line says that it is loaded, as importing torch takes seconds."""
+    import keyss
+    from keyss.progress import waiting
+
+    with waiting("starting", 2.0):
+        return getattr(keyss, name)

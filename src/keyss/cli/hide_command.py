@@ -28,9 +28,9 @@ from keyss.cli.arguments import (
     flag,
     optional,
     switch,
+    verb,
 )
 from keyss.cli.keys import keys
-from keyss.cli.verbs import verb
 from keyss.core.errors import InputError, UsageError
 
 if TYPE_CHECKING:

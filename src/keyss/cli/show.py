@@ -18,9 +18,9 @@ from keyss.cli.arguments import (
     check_exists,
     optional,
     switch,
+    verb,
 )
 from keyss.cli.keys import keys_of_run
-from keyss.cli.verbs import verb
 from keyss.core.errors import UsageError
 
 _VECTOR = r"[-+.\de]+(,[-+.\de]+){2}"
