@@ -62,7 +62,7 @@ class CarryMethod:
         def fit_in(channel: Channel) -> tuple[CarryCapacity, list[int]]:
             capacity = CarryCapacity.of(channel, cover.given, options.fit)
             counts = capacity.sizes(secret_sizes)
-            if not (options.publish or options.format) and cover.given is not None:
+            if cover.given is not None and not (channel.grows or options.publish or options.format):
                 _check_share(secret_sizes, counts)
             return capacity, counts
 
