@@ -19,7 +19,7 @@ from numpy.lib.recfunctions import unstructured_to_structured
 from plyfile import PlyData, PlyElement
 
 import keyss
-from keyss import CarryOptions, FitConfig, Secret
+from keyss import CarryOptions, FitConfig, Secret, SecretFile
 from keyss.cli import main
 from keyss.core import InputError, OutputError, Scene, UsageError, WrongKeyError
 from tiny_scenes import HEIGHT, WIDTH, random_gaussians, tiny_scene
@@ -251,11 +251,21 @@ def test_public_api() -> None:
         ("g.ply", r"expected a list, such as \[Secret"),
         (Secret("g.ply", "key"), r"expected a list, such as \[Secret"),
         ([], "expected 1 to"),
+        ([Secret("g.ply", "key"), SecretFile(b"", "other key")], "scenes or files, got both"),
     ],
 )
 def test_secrets_say_what_is_expected(secrets: Any, words: str) -> None:
     with pytest.raises(UsageError, match=words):
         keyss.hide(random_gaussians(), secrets)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"bound": True}, "`bound` is for hidden scenes"), ({"method": "keyss"}, "keyss hides scenes only")],
+)
+def test_options_of_scenes_are_refused_for_files(options: Any, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        keyss.hide(random_gaussians(), [SecretFile(b"", "a key of a file")], **options)
 
 
 def test_method_by_name_has_the_default_preset() -> None:

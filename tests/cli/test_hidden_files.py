@@ -53,6 +53,15 @@ def test_round_trip(keyss: Run, folder: Path, tmp_path: Path) -> None:
         assert stat.S_IMODE(out.stat().st_mode) == 0o600
 
 
+def test_hidden_model_file_is_revealed_as_it_was(tmp_path: Path) -> None:
+    """Its suffix is that of a model, and its bytes are not read as one."""
+    hidden = library.hide(trained_like(2000), [library.SecretFile(b"any bytes", KEYS[0], "scan.ply")])
+    library.reveal(hidden.stego, KEYS[0], out=tmp_path / "back.ply")
+    assert (tmp_path / "back.ply").read_bytes() == b"any bytes"
+    with pytest.raises(UsageError, match=r"name the output like it, not back\.spz"):
+        library.reveal(hidden.stego, KEYS[0], out=tmp_path / "back.spz")
+
+
 def test_verify(keyss: Run, folder: Path) -> None:
     stego = folder / "out" / "publish" / "model.ply"
     for index, count in enumerate(("3,000 of 3,000", "0")):
