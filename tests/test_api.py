@@ -261,7 +261,7 @@ def test_secrets_say_what_is_expected(secrets: Any, words: str) -> None:
 
 @pytest.mark.parametrize(
     ("options", "words"),
-    [({"bound": True}, "`bound` is for hidden scenes"), ({"method": "keyss"}, "keyss hides scenes only")],
+    [({"min_psnr": 0}, "`min_psnr` is for hidden scenes"), ({"method": "keyss"}, "keyss hides scenes only")],
 )
 def test_options_of_scenes_are_refused_for_files(options: Any, words: str) -> None:
     with pytest.raises(UsageError, match=words):

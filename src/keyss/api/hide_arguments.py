@@ -105,7 +105,7 @@ def check_arguments(out: PathLike | None, min_psnr: float | None) -> None:
 def check_not_given(**for_scenes: object) -> None:
     """Raise UsageError for an argument that hidden files do not use."""
     for name, value in for_scenes.items():
-        if value not in (None, False):
+        if value is not None and value is not False:
             raise UsageError(f"`{name}` is for hidden scenes, not for files: leave it out")
 
 
