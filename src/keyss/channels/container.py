@@ -1,13 +1,16 @@
-"""The container, the same in every channel: payload, bytes, sealed bytes, shards; and back with a key.
+"""The container of every channel: from a payload to sealed bytes and shards, and back with a key.
 
-A payload is packed into bytes. They are compressed if that helps, padded, encrypted and authenticated under
-a *data key* of the file (`seal`). A *record* may come first, by which a reader detects foreign Gaussians (see
-`foreign`). Reed-Solomon makes shards of sealed bytes, where a channel may lose some. The channel finds slots
-for shards in a cover, writes and reads them.
+`seal` packs a payload into bytes, compresses them if that helps, and encrypts and authenticates them under a
+*data key*. A *record* comes first, by which a reader detects foreign Gaussians (see `foreign`). Where a
+channel may lose slots, Reed-Solomon divides sealed bytes into shards with redundancy (`reed_solomon`). The
+channel finds slots in a cover, writes shards into them and reads them.
 
-A salt is stored with the secret, so that guessing a key takes one run of Argon2id for each file. No key
-stream is used twice: data keys depend on entropy and all payloads. *Parameters*, encrypted like shards, tell
-how the shards lie in their slots:
+All randomness is derived from `entropy`, which must be secret: otherwise the holder of one key could compute
+the file without the other secrets and compare. A salt depends on the file, in colours on its cover, so
+guessing a key takes a run of Argon2id for each. No key stream is used twice: data keys depend on entropy and
+all payloads.
+
+*Parameters*, encrypted like shards, tell how shards lie in their slots:
 
     check (8 bytes, derived from the data key), version (1), depth (1), codewords (4), shards of one (2), data
     shards of one (2); little-endian

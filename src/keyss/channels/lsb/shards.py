@@ -1,4 +1,4 @@
-"""What a key finds in the low bits of Gaussians by their IDs alone.
+"""Shards and messages in slots with IDs, the low bits of Gaussians.
 
 Everything follows from a pseudo-random function of a secret and each Gaussian's ID, AES-256: Gaussians may
 have any order, and nothing marks a carrier. No pad is used twice, because every secret here is new for every

@@ -1,5 +1,5 @@
 /**
- * What a key finds in the low bits of Gaussians by their IDs alone; counterpart of `keyss.channels.lsb.shards`
+ * Shards and messages in slots with IDs, the low bits of Gaussians; counterpart of `keyss.channels.lsb.shards`
  * (docs/byte-layout.md, "Messages" and "Shards").
  */
 import { bytesKey, mostFrequent, rowsOf, viewOf } from '../../core/bytes.ts';
