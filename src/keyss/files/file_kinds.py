@@ -16,6 +16,7 @@ from pathlib import Path
 
 from keyss.core.errors import BackendError, InputError, KeyssWarning
 from keyss.files.inputs import open_input
+from keyss.files.model_formats import FORMATS
 
 CONVERT = "convert it to .ply first, e.g. with `splat-transform IN OUT.ply`"
 _MODEL = "give it where a model is asked for"
@@ -61,10 +62,7 @@ class _Kind:
 
 # The first matching suffix wins, else the first matching content.
 _KINDS = (
-    _Kind("an SPZ model", _MODEL, (".spz",), (b"NGSP",)),
-    _Kind("an SOG model", _MODEL, (".sog",)),
-    _Kind("a .splat model", _MODEL, (".splat",)),
-    _Kind("a glTF file", _MODEL, (".glb",), (b"glTF",)),
+    *(_Kind(each.kind, _MODEL, each.suffixes, each.magic) for each in FORMATS if each.magic != (b"ply",)),
     _Kind("a .ksplat model", CONVERT, (".ksplat",)),
     _Kind("an LCC model", CONVERT, (".lcc", ".lcc2")),
     _Kind("a glTF file with its data beside it", "export a .glb from the program that made it", (".gltf",)),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from statistics import fmean
 
 from keyss.channels import is_appended
@@ -16,7 +16,8 @@ from keyss.core.errors import UsageError, import_extra
 from keyss.core.gaussians import Gaussians
 from keyss.lab.audits import PARTS
 from keyss.lab.audits.audit_run import EXTRA
-from keyss.lab.audits.parts import Subject, published_distance, render_times, stegexpose_aucs
+from keyss.lab.audits.parts import published_distance, render_times, stegexpose_aucs
+from keyss.lab.audits.subject import Subject, Work
 from keyss.lab.robustness.changes import Change, opacity_pruning, purification, random_pruning
 from keyss.lab.robustness.converters import converters
 from keyss.lab.robustness.survival import ChangedQuality, measure_robustness
@@ -129,17 +130,30 @@ def sinkhorn(subject: Subject) -> Numbers:
     return found | {"sinkhorn": distances.sum, "score": score}
 
 
-# Modules of optional packages that measures import.
-_MODULES = {"secrecy": ("sklearn",), "sinkhorn": ("ot",), **dict.fromkeys(PARTS, EXTRA)}
-MEASURES: Mapping[str, Callable[[Subject], Numbers]] = {
-    each.__name__: each for each in (files, pictures, secrecy, survival, rendering, pruning, sinkhorn)
+@dataclass(frozen=True)
+class Measure:
+    """An entry of the table of measures."""
+
+    numbers: Callable[[Subject], Numbers]
+    work: Work
+    modules: tuple[str, ...] = ()  # of the extra `audit`
+
+
+MEASURES = {
+    "files": Measure(files, Work()),
+    "pictures": Measure(pictures, Work(views=8)),
+    "secrecy": Measure(secrecy, Work(seconds=0.5, views=43, per_gaussian=9e-4), ("sklearn",)),
+    "survival": Measure(survival, Work(seconds=8.0, views=48)),
+    "rendering": Measure(rendering, Work(views=16)),
+    "pruning": Measure(pruning, Work(seconds=8.0, views=200)),
+    "sinkhorn": Measure(sinkhorn, Work(seconds=1.0, per_gaussian=1e-4), ("ot",)),
 }
 
 
 def check_extras(measures: Iterable[str]) -> None:
-    """Raise BackendError if a package of one of the measures is not installed."""
+    """Raise BackendError if a package of one of the measures, or parts of an audit, is not installed."""
     for name in measures:
-        for module in _MODULES.get(name, ()):
+        for module in EXTRA if name in PARTS else MEASURES[name].modules:
             import_extra(module, "audit", f"measure {name}")
 
 

@@ -27,7 +27,7 @@ from keyss.files import read_model, write_bytes
 from keyss.fitting import FitConfig
 from keyss.keys import MasterKey, read_key
 from keyss.lab.audits import PARTS, audit
-from keyss.lab.audits.parts import Subject
+from keyss.lab.audits.subject import Subject
 from keyss.lab.audits.trial_measures import MEASURES
 from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
@@ -37,7 +37,7 @@ from keyss.runs.estimates import seconds_for
 from keyss.runs.files import METRICS, as_scene, stego_in
 from keyss.runs.folder import PRIVATE, make_private
 from keyss.runs.open_run import HidingRun, open_run
-from keyss.runs.planning import Cost, cost_of_fit, view_seconds
+from keyss.runs.planning import Cost, cost_of_fit
 
 TRIAL, RESULT, RUN = "trial.json", "result.json", "run"
 MASTER_KEY = f"{PRIVATE}/master-key.txt"  # relative to the folder of all trials
@@ -78,17 +78,6 @@ class Trial:
         """Names of the trials whose models it uses."""
         models = [each for each in (*self.models, *self.controls) if each and not os.path.isabs(each)]
         return [Path(each).parts[1] for each in models]
-
-
-# Seconds of measures: of all, mostly attempts to open; in views rendered; and per Gaussian.
-_COSTS = {
-    "files": (0.0, 0, 0.0),
-    "pictures": (0.0, 8, 0.0),
-    "secrecy": (0.5, 43, 9e-4),
-    "survival": (8.0, 48, 0.0),
-    "robustness": (100.0, 1000, 0.0),
-}
-_OTHER_COST = 1.0, 16, 1e-4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,8 +138,7 @@ def cost_of_trial(trial: Trial, folder: Path) -> Cost:
 
 def _seconds_of(measures: Sequence[str], view: float, gaussians: int) -> float:
     """About the seconds of measures; `view`: see `Cost.view_seconds`, `gaussians`: of the published model."""
-    costs = [_COSTS.get(name, _OTHER_COST) for name in measures]
-    return sum(fixed + views * view + each * gaussians for fixed, views, each in costs)
+    return sum((PARTS.get(name) or MEASURES[name]).work.time(view, gaussians) for name in measures)
 
 
 def keys_of(trial: Trial, folder: Path) -> list[str]:
@@ -224,18 +212,14 @@ def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -
         more: dict[str, Any] = {"device": trial.device, "overwrite": done, "resume": resume}
         audited = audit(run, keys_of(trial, folder), only=parts, reporter=reporter, **more)
         for part in parts:
-            found |= flat(msgspec.to_builtins(getattr(audited, part)), f"audit.{part}")
+            found |= flat(audited.sections[part].numbers, f"audit.{part}")
     if others := [name for name in names if name not in PARTS]:
         device = resolve_device(trial.device)
         with reporter.waiting(f"opening {trial.name}", seconds_for("reveal", stego_in(folder / RUN))):
             controls = [read_model(_place(folder, each)).to(device) for each in trial.controls]
             subject = Subject(opened_run(trial, folder), device, controls)
-            models = [subject.stego, *subject.revealed]
-            view = sum(
-                view_seconds(device.type, len(model), scene)
-                for model, scene in zip(models, subject.scenes, strict=True)
-            )
+            view = subject.view_seconds
         for name in others:
             with reporter.waiting(f"{trial.name}: {name}", _seconds_of([name], view, len(subject.stego))):
-                found |= {f"{name}.{each}": value for each, value in MEASURES[name](subject).items()}
+                found |= {f"{name}.{each}": value for each, value in MEASURES[name].numbers(subject).items()}
     return found
