@@ -40,7 +40,7 @@ def test_reports_quality(keyss: Run, files: Path, tmp_path: Path, suffix: str) -
     first, *others = result.out.splitlines()
     assert first.startswith(f"{out}: {COUNT} Gaussians, {out.stat().st_size / 1e3:.1f} kB, ")
     if suffix == "ply":
-        assert first.endswith("renders unchanged")
+        assert first.endswith("renders the same")
         assert not others
     else:
         psnr = float(first.split("renders at ")[1].split()[0])
@@ -85,7 +85,7 @@ def test_quality_is_scale_invariant(keyss: Run, tmp_path: Path, unit: float) -> 
         costs.append(float(result.split("renders at ")[1].split()[0]))
     assert costs[0] == pytest.approx(costs[1], abs=1.0)
     result = keyss("convert", tmp_path / "other.ply", tmp_path / "other.spz")
-    assert "unchanged" not in result.out
+    assert "renders the same" not in result.out
     assert len(read_model(tmp_path / "other.spz").means.unique(dim=0)) == COUNT or unit < 1e-4
 
 

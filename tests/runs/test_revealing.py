@@ -12,7 +12,7 @@ from tiny_scenes import random_gaussians
 
 
 @pytest.mark.parametrize(
-    ("remains", "expected"),
+    ("recovered", "expected"),
     [
         (Recovered(100, 100, (12, 12)), []),
         (Recovered(100, 100, (9, 12)), ["3 of 12 shards of the secret's payload were lost, and restored"]),

@@ -94,7 +94,7 @@ test('appended Gaussians survive pruning of a fifth and any order', async () => 
   const derive = remembered(here);
   const found = await AppendedReader.of(some(model, 0.8, 7))!.open(wanted.key, derive);
   expect(digest(found!.data)).toBe(wanted.payload);
-  await expect(AppendedReader.of(some(model, 0.4, 8))!.open(larger.key, derive)).rejects.toThrow(/^The key is right/);
+  await expect(AppendedReader.of(some(model, 0.5, 8))!.open(larger.key, derive)).rejects.toThrow(/^The key is right/);
   expect(await AppendedReader.of(model)!.open('another key', derive)).toBeNull();
   expect(AppendedReader.of(selected(model, [...Array(120).keys()]))).toBeNull(); // the cover alone
 });
@@ -117,6 +117,18 @@ test('a secret put into another file is told', async () => {
   expect(digest((await AppendedReader.of(together(model, faint))!.open(wanted.key, derive))!.data)).toBe(wanted.payload);
   for (const kept of [model, together(appended, some(cover, 0.3, 4))]) {
     expect((await AppendedReader.of(kept)!.open(wanted.key, derive))!.foreign).toBeUndefined();
+  }
+});
+
+test('a secret beside a model that is far larger, or has equal numbers, warns', async () => {
+  const [model, wanted] = [await modelOf('appended.ply'), OPENED.find((each) => each.file === 'appended.ply' && 'payload' in each)!];
+  const host = await modelOf('published.spz');
+  const far = { scale: 1e6, rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1], translation: [1e9, 1e9, 1e9] };
+  const equal = { ...host, opacityLogits: host.opacityLogits.map(() => 2), logScales: host.logScales.map(() => -4) };
+  for (const file of [together(host, moved(far, model)), together(equal, model)]) {
+    const found = await AppendedReader.of(file)!.open(wanted.key, remembered(here));
+    expect(digest(found!.data)).toBe(wanted.payload);
+    expect(found!.foreign).toBeGreaterThan(0.9 * host.count);
   }
 });
 

@@ -203,7 +203,7 @@ def print_conversion(out: Path, found: Conversion, *, dry_run: bool) -> None:
         print(out, file=file)
         return
     was = "" if found.bytes_before is None else f", {_size(found.bytes_before)} before"
-    renders = "renders unchanged" if found.psnr >= 120 else f"renders at {found.psnr:.1f} dB PSNR"
+    renders = "renders the same" if found.psnr >= 120 else f"renders at {found.psnr:.1f} dB PSNR"
     if math.isnan(found.psnr):
         renders = "renders are empty: the model is invisible"
     print(f"{out}: {len(found.gaussians):,} Gaussians, {_size(found.bytes_after)}{was}, {renders}", file=file)

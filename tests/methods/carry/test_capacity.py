@@ -54,7 +54,7 @@ def test_predictable_cover_is_refused() -> None:
         model.opacity_logits,
         model.sh[:, :, :1].repeat(1, 1, 3),
     )
-    with pytest.raises(UsageError, match=r"random low bits.*`publish=.any.`"):
+    with pytest.raises(UsageError, match=r"random low bits.*`publish=.converted.`"):
         _prepare(CarryOptions(format="ply"), grey, grey)
     with pytest.warns(KeyssWarning, match=r"whoever inspects.*random low bits"):
         assert _prepare(CarryOptions(), grey, grey).publish == "converted"
