@@ -23,9 +23,8 @@ from typing import Any
 
 from keyss.core import Camera, Gaussians
 from keyss.files import read_model
-from keyss.fitting.config import FitConfig
-from keyss.fitting.losses import Target, photometric_loss
-from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
+from keyss.fitting import FitConfig, Target, make_optimizers, photometric_loss, to_parameters
+from keyss.fitting.parameters import to_gaussians
 from keyss.rendering import rasterization, render
 
 import torch

@@ -37,8 +37,8 @@ from channels.lsb.payloads import embed_derived
 from channels.lsb.trained_like import keys, rounded
 from keyss.core import Gaussians, UsageError
 from keyss.lab import stealth_statistics
+from keyss.methods import CarryOptions
 from keyss.methods.carry.capacity import CarryCapacity
-from keyss.methods.carry.carry_options import CarryOptions
 from keyss.rendering import Viewpoints
 from lab.stealth.candidates import candidate_scores
 from methods.carry import carried

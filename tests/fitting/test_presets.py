@@ -7,7 +7,8 @@ import torch
 
 import keyss
 from keyss.core import UsageError
-from keyss.fitting.config import PRESETS, FitConfig, preset_for
+from keyss.fitting import PRESETS, FitConfig
+from keyss.fitting.config import preset_for
 from keyss.methods import registry
 
 

@@ -12,7 +12,7 @@ from keyss.files import write_model
 from keyss.runs.estimates import gaussians_in, seconds_for, seconds_to_convert, seconds_to_prepare
 
 
-def test_sizes_of_models_are_those_of_headers_or_about_right(tmp_path: Path) -> None:
+def test_sizes_of_models(tmp_path: Path) -> None:
     (tmp_path / "point_cloud/iteration_7").mkdir(parents=True)
     inside = tmp_path / "point_cloud/iteration_7/point_cloud.ply"
     write_model(inside, model_of(3000, 2))
@@ -33,7 +33,7 @@ def test_times_grow_with_models_and_secrets(tmp_path: Path) -> None:
     for task in ("info", "verify", "reveal", "hide a file", "export", "render"):
         assert seconds_for(task, small) < seconds_for(task, large)
     one, two = (seconds_to_convert(large, Path("c.compressed.ply"), keys) for keys in (0, 1))
-    assert one == seconds_for(".compressed.ply", large) < two
+    assert seconds_to_convert(large, Path("c.ply"), 0) < one < two
     assert seconds_to_prepare([small, None, large, "missing"]) == pytest.approx(
         seconds_for("prepare", small) + seconds_for("prepare", large) - seconds_for("prepare", Path("none"))
     )

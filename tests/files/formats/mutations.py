@@ -32,8 +32,7 @@ import torch
 
 from files.formats.false_sizes import FALSE_SIZES, image
 from files.scene_files import camera_bytes, counted, image_bytes, point_bytes
-from keyss.core import Gaussians, InputError
-from keyss.core.picture_network import DecodedGaussians, PictureNetwork
+from keyss.core import DecodedGaussians, Gaussians, InputError, PictureNetwork
 from keyss.files import FORMATS, load_scene, model_bytes, model_of_bytes
 from keyss.files.formats.spz import SpzCodes
 from keyss.files.images import read_image

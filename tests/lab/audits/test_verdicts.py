@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from keyss.lab import Auc
+from keyss.lab import AttackResult, Auc, ChangedQuality
 from keyss.lab.audits import Verdict, headline
 from keyss.lab.audits.parts import (
     distance_verdicts,
@@ -19,10 +19,10 @@ from keyss.lab.audits.parts import (
     wrong_key_verdicts,
 )
 from keyss.lab.distances import AttributeDistance
-from keyss.lab.leaks.leak_scores import AttackResult, LeakScores
-from keyss.lab.robustness.survival import ChangedQuality, ChangeResult
+from keyss.lab.leaks.leak_scores import LeakScores
+from keyss.lab.robustness.survival import ChangeResult
 from keyss.lab.stealth.judging import JudgedStatistic, StealthResult
-from keyss.measure.hide_quality import PsnrRange, WrongKeys
+from keyss.measure import PsnrRange, WrongKeys
 
 
 @pytest.mark.parametrize(

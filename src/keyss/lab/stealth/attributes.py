@@ -267,3 +267,6 @@ def shapes_of(model: Gaussians) -> dict[str, Doubles]:
         part = model.sh[:, band**2 : (band + 1) ** 2].detach().cpu().double()
         shapes[f"harmonics of degree {band}"] = part.square().sum((1, 2)).clamp_min(1e-24).log().numpy()
     return shapes
+
+
+DETECTORS = (invariants, opacities, order, colours)

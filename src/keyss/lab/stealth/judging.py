@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,15 +12,11 @@ from scipy.special import stdtr
 from keyss.channels import DEEPEST
 from keyss.core import Gaussians, UsageError
 from keyss.core.arrays import Numbers
-from keyss.lab.stealth.attributes import colours, invariants, invisible_modes, opacities, order
-from keyss.lab.stealth.low_bits import agreement, bits, coincidences, steps
+from keyss.lab.stealth import attributes, low_bits
+from keyss.lab.stealth.attributes import invisible_modes
 from keyss.lab.stealth.statistic import BitPatterns, Statistic
 
-# Detectors by kind: functions of a model and its bit patterns that give statistics by name.
-KINDS: dict[str, Callable[[Gaussians, BitPatterns], dict[str, Statistic]]] = {
-    each.__name__: each
-    for each in (bits, agreement, coincidences, steps, invariants, opacities, order, colours)
-}
+DETECTORS = (*low_bits.DETECTORS, *attributes.DETECTORS)
 _AGREEMENT = 0.03  # relative error assumed for a statistic without a known error
 _MANY = 1e7  # degrees of freedom: normal
 
@@ -29,7 +25,7 @@ _MANY = 1e7  # degrees of freedom: normal
 class JudgedStatistic:
     """A statistic of the file, and of control models."""
 
-    name: str  # "kind: what is counted"
+    name: str  # "detector: what is counted"
     value: float
     low: float  # minimum of the controls
     high: float  # maximum of the controls
@@ -49,14 +45,14 @@ class StealthResult:
 
 
 def stealth_statistics(model: Gaussians) -> dict[str, Statistic]:
-    """Statistics of one file by "kind: name", if there is enough data; kinds are KINDS.
+    """Statistics of one file by "detector: name", if there is enough data.
 
     Takes half a second for 10,000 Gaussians.
     """
     words = BitPatterns.of(model)
     return {
-        f"{kind}: {name}": statistic
-        for kind, detect in KINDS.items()
+        f"{detect.__name__}: {name}": statistic
+        for detect in DETECTORS
         for name, statistic in detect(model, words).items()
         if not math.isnan(statistic.value)
     }

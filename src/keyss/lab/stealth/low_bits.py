@@ -381,3 +381,6 @@ def _cells(words: Words32) -> Doubles:
     """The range of each number's low bits."""
     powers = (words & np.uint32(0x7F800000)).view(np.float32).astype(np.float64)
     return powers * 2.0 ** (DEEPEST + 1 - MANTISSA)
+
+
+DETECTORS = (bits, agreement, coincidences, steps)
