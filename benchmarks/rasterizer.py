@@ -13,7 +13,6 @@ import os
 import platform
 import resource
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,10 +28,6 @@ from keyss.rendering import rasterization, render
 
 import torch
 from torch import Tensor
-
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "tests"))
-from rendering.dense_reference import dense_rasterization  # noqa: E402
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,29 +172,6 @@ def measure_step(case: Case, threads: int, repeats: int) -> list[str]:
     return [f"{case.name}, {case.width}x{case.height}", str(threads), *numbers, ratio]
 
 
-def measure_against_torch(threads: int, repeats: int) -> list[str]:
-    """One row of the third table: plain torch, all Gaussians at all pixels, on a small scene."""
-    torch.set_num_threads(threads)
-    case = Case(name="1000 synthetic", width=64, height=48, count=1000)
-    gaussians, camera = case.scene()
-    leaves, weights, clock = leaves_of(gaussians), weights_for(camera), Clock()
-    view = (camera.viewmat, camera.K, camera.width, camera.height)
-    for _ in range(repeats + 1):
-        image = clock("forward, torch", lambda: dense_rasterization(*leaves, *view, torch.zeros(3), 3)[0])
-        clock("backward, torch", partial(image.backward, weights))
-        image = clock("forward", partial(draw, leaves, camera, 3))
-        clock("backward", partial(image.backward, weights))
-    theirs = [clock.best(f"{part}, torch") for part in ("forward", "backward")]
-    ours = [clock.best(part) for part in ("forward", "backward")]
-    return [
-        f"{case.name}, {case.width}x{case.height}",
-        str(threads),
-        *(f"{each:.1f}" for each in theirs),
-        *(f"{each:.2f}" for each in ours),
-        *(f"{their / our:.0f}" for their, our in zip(theirs, ours, strict=True)),
-    ]
-
-
 def _memory() -> int:
     """Bytes of memory in use by this process; the peak so far on systems that do not report it."""
     try:
@@ -247,11 +219,6 @@ def main() -> None:
             ["training step", "threads", "rasterizer alone", "render", "loss", "backward", "optimiser",
              "step", "step / rasterizer"],
             [run_alone(measure_step, case, threads, n) for case, threads in pairs],
-        ),
-        (
-            ["plain torch", "threads", "its forward", "its backward", "our forward", "our backward",
-             "forward, times faster", "backward, times faster"],
-            [run_alone(measure_against_torch, threads, n) for threads in options.threads],
         ),
     ]  # fmt: skip
     heading = (
