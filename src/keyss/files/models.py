@@ -146,29 +146,29 @@ def check_model_output(path: Path | str, overwrite: bool, inputs: Sequence[Path]
 
 def _for_writing(path: Path | str) -> ModelFormat:
     """The format of the suffix. Raises UsageError if it is unknown."""
-    found = PLY if is_standard(path) else format_of(path)
-    if found is None:
+    model_format = PLY if is_standard(path) else format_of(path)
+    if model_format is None:
         raise UsageError(f"cannot write a model as {path}: expected a name that ends in {known_suffixes()}")
-    return found
+    return model_format
 
 
 def _write(file: BinaryIO, path: Path | str, model: Gaussians) -> None:
-    found = _for_writing(path)
-    if isinstance(model, DecodedGaussians) and found is not DECODED:
+    model_format = _for_writing(path)
+    if isinstance(model, DecodedGaussians) and model_format is not DECODED:
         raise UsageError(
             f"cannot write {path}: a network decodes what this model renders, which 3DGS files cannot hold; "
             f"use a name that ends in {DECODED_SUFFIX}, which `keyss render` reads"
         )
-    if found is DECODED and not isinstance(model, DecodedGaussians):
+    if model_format is DECODED and not isinstance(model, DecodedGaussians):
         raise UsageError(
             f"cannot write a 3DGS model as {path}: {DECODED_SUFFIX} is for models that a network decodes; "
             "use a name that ends in .ply"
         )
     try:
-        if found is PLY:
+        if model_format is PLY:
             ply.write(model, file)
         else:
-            file.write(_codec(found).write(model))
+            file.write(_codec(model_format).write(model))
     except OutputError as error:
         raise OutputError(f"cannot write {path}: {error}") from error
 

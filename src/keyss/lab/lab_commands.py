@@ -299,22 +299,22 @@ def _scene_tables(stem: str) -> dict[str, str]:
     return {f"{stem}.csv": scenes, f"{stem}.tex": "the same, for LaTeX (booktabs)"}
 
 
-def _print_forecast(found: Forecast) -> None:
+def _print_forecast(forecast: Forecast) -> None:
     """Print the trials of a dry run, with estimates for those to do."""
     from keyss.cli.tables import print_table
     from keyss.progress import about
 
     rows = []
-    for place, name in found.names.items():
-        time, memory = "cannot work" if place in found.refused else "done", ""
-        if (cost := found.costs.get(place)) is not None:
+    for place, name in forecast.names.items():
+        time, memory = "cannot work" if place in forecast.refused else "done", ""
+        if (cost := forecast.costs.get(place)) is not None:
             time, memory = about(cost.seconds), f"{cost.memory_bytes / 1e9:.1f} GB"
         rows.append((name, time, memory))
     print_table(("run", "time, about", "memory"), rows)
-    for place, reason in found.refused.items():
-        print(f"{found.names[place]}: {reason}")
+    for place, reason in forecast.refused.items():
+        print(f"{forecast.names[place]}: {reason}")
     print(
-        f"{len(rows)} run{'s' * (len(rows) != 1)}, {len(found.costs)} to do: about "
-        f"{about(sum(cost.seconds for cost in found.costs.values()))} on this machine."
+        f"{len(rows)} run{'s' * (len(rows) != 1)}, {len(forecast.costs)} to do: about "
+        f"{about(sum(cost.seconds for cost in forecast.costs.values()))} on this machine."
     )
     print("Dry run: nothing was written. Times are rough; measurements are included.")

@@ -134,7 +134,7 @@ def test_whole_audit(run_folder: Path) -> None:
     assert not any(key.encode() in saved for key in KEYS)
 
 
-def test_ratio_of_equal_and_of_smaller_models(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_render_time_ratio(monkeypatch: pytest.MonkeyPatch) -> None:
     # Processor time: whatever else runs does not count.
     monkeypatch.setattr(render_time, "time", SimpleNamespace(perf_counter=time.process_time))
     scene, model = tiny_scene(0, views=8), random_gaussians(4000)
@@ -145,7 +145,7 @@ def test_ratio_of_equal_and_of_smaller_models(monkeypatch: pytest.MonkeyPatch) -
     assert more.ratio > same.ratio / 10
 
 
-def test_forecasts_need_no_keys_and_grow_with_the_work(run: Path) -> None:
+def test_forecast(run: Path) -> None:
     found = forecast_audit(run)
     assert list(found) == ["controls", *PARTS]
     more = forecast_audit(run, controls=6, only=("speed", "stealth"))

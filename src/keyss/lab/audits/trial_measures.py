@@ -55,10 +55,10 @@ def rendering(subject: Subject) -> Numbers:
 def pictures(subject: Subject, stego: Gaussians | None = None) -> Numbers:
     """Speed of rendering the published model (or `stego`) and the first secret."""
     times = render_times(subject, subject.stego if stego is None else stego, rounds=_ROUNDS)
-    found: Numbers = {}
+    numbers: Numbers = {}
     for role, time in zip(_ROLES, times, strict=False):
-        found |= {f"pictures/s, {role}": 1 / time.seconds, f"time over 3DGS, {role}": time.ratio}
-    return found
+        numbers |= {f"pictures/s, {role}": 1 / time.seconds, f"time over 3DGS, {role}": time.ratio}
+    return numbers
 
 
 def secrecy(subject: Subject) -> Numbers:
@@ -68,12 +68,12 @@ def secrecy(subject: Subject) -> Numbers:
     Gaussians from the controls', and minimum p-value of its statistics, corrected for their number.
     """
     stego, controls = subject.stego, subject.controls
-    found: Numbers = {"stegexpose": stegexpose_aucs(subject, [stego])[0].auc}
+    numbers: Numbers = {"stegexpose": stegexpose_aucs(subject, [stego])[0].auc}
     if subject.standard:
-        found["stealth"] = judge(stego, controls).least
+        numbers["stealth"] = judge(stego, controls).least
         with suppress(UsageError):  # too few Gaussians, or all in a corner
-            found["classifier"] = fmean(two_sample_auc(each, stego).auc for each in controls)
-    return found
+            numbers["classifier"] = fmean(two_sample_auc(each, stego).auc for each in controls)
+    return numbers
 
 
 def survival(subject: Subject) -> Numbers:
@@ -83,11 +83,11 @@ def survival(subject: Subject) -> Numbers:
     if subject.standard:
         changes |= {format: tools[format, tool].change() for format, tool in CONVERSIONS.items()}
         changes["purified"] = purification(subject.scenes[0], _GIVEN_UP)
-    found = _after(subject, changes, lambda quality: 0.0 - quality.loss)
-    found = {name: value for name, value in found.items() if not name.startswith(_WHOLE)}
+    numbers = _after(subject, changes, lambda quality: 0.0 - quality.loss)
+    numbers = {name: value for name, value in numbers.items() if not name.startswith(_WHOLE)}
     if not subject.standard:
-        found |= dict.fromkeys((*CONVERSIONS, "purified"), "the method publishes no 3DGS model")
-    return found
+        numbers |= dict.fromkeys((*CONVERSIONS, "purified"), "the method publishes no 3DGS model")
+    return numbers
 
 
 def pruning(subject: Subject) -> Numbers:
@@ -113,21 +113,21 @@ def _after(
     """
     openers, every = subject.run.openers, list(changes.values())
     results = measure_robustness(subject.stego, openers, subject.scenes, changes=every, max_views=max_views)
-    found: Numbers = {}
+    numbers: Numbers = {}
     for name, result in zip([_WHOLE, *changes], results, strict=True):
         if result.skipped is not None:
-            found[name] = result.skipped
+            numbers[name] = result.skipped
         for role, quality in zip(_ROLES, (result.cover, *result.secrets), strict=False):
             if quality is not None and quality.opens:
-                found[f"{name}, {role}"] = number(quality)
-    return found
+                numbers[f"{name}, {role}"] = number(quality)
+    return numbers
 
 
 def sinkhorn(subject: Subject) -> Numbers:
     """3D-Sinkhorn from the cover's plain model to the published one: sum, attributes, composite score."""
     distances, score = published_distance(subject, own_gaussians(subject.stego))
-    found: Numbers = {f"sinkhorn {short}": getattr(distances, name) for name, short in _ATTRIBUTES.items()}
-    return found | {"sinkhorn": distances.sum, "score": score}
+    numbers: Numbers = {f"sinkhorn {short}": getattr(distances, name) for name, short in _ATTRIBUTES.items()}
+    return numbers | {"sinkhorn": distances.sum, "score": score}
 
 
 @dataclass(frozen=True)

@@ -163,8 +163,8 @@ def compare(
     arguments = {"cover": scenes[0], "secret": scenes[1], "iterations": fit.iterations}
     arguments |= {"max_gaussians": fit.max_gaussians, "width": width, "seeds": list(seeds)}
     rows = [_row(name, [outcomes[places[name, seed]] for seed in seeds], folder) for name in chosen]
-    found = Comparison(arguments=arguments, methods=tuple(rows))
-    write_record(folder.out / f"{STEM}.json", found)
+    comparison = Comparison(arguments=arguments, methods=tuple(rows))
+    write_record(folder.out / f"{STEM}.json", comparison)
     names = [os.path.basename(scene) for scene in scenes]
     done = {each: outcomes[place] for each, place in places.items() if outcomes[place].result}
     numbers = [TrialNumbers({"method": name}, names, seed, each) for (name, seed), each in done.items()]
@@ -176,7 +176,7 @@ def compare(
     }
     if runs:
         write_bytes(folder.out / f"{STEM}.png", comparison_sheet(runs, device))
-    return found
+    return comparison
 
 
 def _add(
@@ -188,14 +188,14 @@ def _add(
     controls: list[str],
 ) -> Path:
     """Add a hiding and its plain fits; returns the folder of the hiding."""
-    own = fit.iterations // 2
+    half = fit.iterations // 2
     continues = [each.continues and each.steps > 0 for each in preset.training(2)]
     options = preset.with_fit(
-        iterations=max(1, own) if any(continues) else fit.iterations,
+        iterations=max(1, half) if any(continues) else fit.iterations,
         max_gaussians=fit.max_gaussians,
         seed=fit.seed,
     )
-    steps = [fit.iterations - own if each else fit.iterations for each in continues]
+    steps = [fit.iterations - half if each else fit.iterations for each in continues]
     models = [
         folder.plain(
             scene,
@@ -248,9 +248,9 @@ def comparison_sheet(runs: Mapping[str, HidingRun], device: Backend) -> bytes:
     return contact_sheet(["cover", "secret", "error of the secret, x4"], rows)
 
 
-def comparison_tables(found: Comparison) -> list[list[list[str]]]:
+def comparison_tables(comparison: Comparison) -> list[list[list[str]]]:
     """Two tables of text, heads first: fidelity and cost, secrecy and survival; without failed methods."""
-    rows = [each for each in found.methods if each.error is None]
+    rows = [each for each in comparison.methods if each.error is None]
     return [
         [
             ["method", *(head.rstrip() for head in columns)],

@@ -148,12 +148,12 @@ def sweep(
     errors.
     """
     path = Path(spec)
-    found = read_spec(path)
-    common = {name: getattr(found, name) for name in ("min_psnr", "bound", "device")}
-    common["views"] = ViewOptions(found.width, found.background, found.skip_missing)
+    spec_ = read_spec(path)
+    common = {name: getattr(spec_, name) for name in ("min_psnr", "bound", "device")}
+    common["views"] = ViewOptions(spec_.width, spec_.background, spec_.skip_missing)
     folder = TrialFolder(Path(out), common)
     rows: dict[Path, tuple[dict[str, Any], list[str], int]] = {}  # labels, scenes and seed
-    for pair, (method, preset, choices), seed in product(found.pairs, variants(path, found), found.seeds):
+    for pair, (method, preset, choices), seed in product(spec_.pairs, variants(path, spec_), spec_.seeds):
         options = preset.with_fit(seed=seed)
         sources = [pair.cover, *pair.secrets]
         given = [pair.cover_model, *(pair.secret_models or [None] * len(pair.secrets))]
@@ -163,7 +163,7 @@ def sweep(
         ]
         chosen = "".join(f" {name}={value}" for name, value in choices.items())
         name = f"{pair.name} {method}{chosen} seed {seed}"
-        place = folder.hiding(name, sources, options, models, measures=found.evaluate)
+        place = folder.hiding(name, sources, options, models, measures=spec_.evaluate)
         labels = {"pair": pair.name, "method": method, **choices}
         rows.setdefault(place, (labels, [Path(source).stem for source in sources], seed))
     if dry_run:

@@ -174,10 +174,10 @@ def flat(record: Any, prefix: str = "") -> dict[str, float]:
         return {prefix: float(record)}
     if isinstance(record, list | tuple):
         record = dict(enumerate(record, start=1))
-    found: dict[str, float] = {}
+    numbers: dict[str, float] = {}
     for name, each in record.items() if isinstance(record, dict) else ():
-        found |= flat(each, f"{prefix}.{name}" if prefix else str(name))
-    return found
+        numbers |= flat(each, f"{prefix}.{name}" if prefix else str(name))
+    return numbers
 
 
 def _hide_arguments(trial: Trial, folder: Path, keys: list[str]) -> dict[str, Any]:

@@ -113,18 +113,18 @@ class TrialFolder:
         with claim_folder(self.out):
             if not (self.out / MASTER_KEY).exists():
                 write_bytes(self.out / MASTER_KEY, f"{generate_key(LONG_KEY_LENGTH)}\n".encode())
-            found = {
+            outcome_of = {
                 folder: Outcome(trial.name, folder, result, skipped=True)
                 for folder, trial in self.trials.items()
                 if (result := finished_result(trial, folder)) is not None
             }
-            due = {folder: trial for folder, trial in self.trials.items() if folder not in found}
+            due = {folder: trial for folder, trial in self.trials.items() if folder not in outcome_of}
             outcomes = _in_process(due, reporter) if ray is None or not due else _on_ray(due, ray, cores)
             for number, outcome in enumerate(outcomes, start=1):
                 state = "failed" if outcome.error else "done"
                 reporter.note(f"[{number}/{len(due)}] {outcome.name}: {state}")
-                found[outcome.folder] = outcome
-        return {folder: found[folder] for folder in self.trials}
+                outcome_of[outcome.folder] = outcome
+        return {folder: outcome_of[folder] for folder in self.trials}
 
     def forecast(self) -> Forecast:
         """The cost of each trial. Writes nothing."""

@@ -67,16 +67,16 @@ def invariants(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     """Unit quaternions in the file and its parts, repeated values, clusters, short numbers."""
     statistics = _lengths(model)
     for index, attribute in enumerate(ATTRIBUTES):
-        own = words.bits[:, words.of_attribute(index)]
-        if not own.size:
+        numbers = words.bits[:, words.of_attribute(index)]
+        if not numbers.size:
             continue
         trained = words.trained[:, words.of_attribute(index)]
         statistics[f"short numbers, {attribute}"] = portion(float((~trained).sum()), trained.size)
-        fields = zip(own.T, trained.T, strict=True)
+        fields = zip(numbers.T, trained.T, strict=True)
         counts = [np.unique(values[kept], return_counts=True)[1] for values, kept in fields]
         repeated = sum(int(each[each > 1].sum()) for each in counts)
-        statistics[f"repeated values, {attribute}"] = portion(repeated, own.size)
-        clusters = [_clusters(values.view(np.float32).astype(np.float64)) for values in own.T]
+        statistics[f"repeated values, {attribute}"] = portion(repeated, numbers.size)
+        clusters = [_clusters(values.view(np.float32).astype(np.float64)) for values in numbers.T]
         hits, trials = (sum(each) for each in zip(*clusters, strict=True))
         statistics[f"clusters of values, {attribute}"] = excess(hits, trials, _CLUSTERED)
     return statistics

@@ -149,8 +149,8 @@ def _sampling(controls: Sequence[Statistic]) -> float:
 
 def changed_low_bits(file: Gaussians, other: Gaussians) -> float:
     """Share of the Gaussians that have an equal in `other` except for low bits."""
-    own, theirs = (BitPatterns.of(model).bits for model in (file, other))
-    shared, same = (np.isin(_as_values(own >> low), _as_values(theirs >> low)) for low in (DEEPEST + 1, 0))
+    words, theirs = (BitPatterns.of(model).bits for model in (file, other))
+    shared, same = (np.isin(_as_values(words >> low), _as_values(theirs >> low)) for low in (DEEPEST + 1, 0))
     return float((shared & ~same).sum() / max(len(file), 1))
 
 
