@@ -258,9 +258,9 @@ def _leak_row(attack: AttackResult) -> tuple[str, ...]:
     scores, leak = attack.scores, attack.leak
     return (
         attack.attack,
-        f"{scores.psnr_fitted:.2f} ({leak.psnr_fitted:+.2f})",
-        f"{scores.ssim_fitted:.3f} ({leak.ssim_fitted:+.3f})",
-        f"{scores.gradient:.3f} ({leak.gradient:+.3f})",
+        f"{scores.psnr_fitted:.2f} ({leak.psnr_fitted:+z.2f})",
+        f"{scores.ssim_fitted:.3f} ({leak.ssim_fitted:+z.3f})",
+        f"{scores.gradient:.3f} ({leak.gradient:+z.3f})",
         attack.best,
     )
 
@@ -272,7 +272,7 @@ def leak_verdicts(results: Mapping[str, Sequence[AttackResult]]) -> list[Verdict
         return []
     name, attack = max(attacks, key=lambda item: item[1].leak.evidence())
     leak, where = attack.leak, f"{name}, {attack.attack}: {attack.best}"
-    value = f"{leak.psnr_fitted:+.2f} dB, {leak.ssim_fitted:+.3f} SSIM, {leak.gradient:+.2f} gradients"
+    value = f"{leak.psnr_fitted:+z.2f} dB, {leak.ssim_fitted:+z.3f} SSIM, {leak.gradient:+z.2f} gradients"
     limit = f"at most {PSNR_LIMIT} dB, {SSIM_LIMIT} and {GRADIENT_LIMIT}"
     word: Word = "fine" if leak.evidence() <= 1 else "visible"
     return [Verdict("leaks without the key", f"{value} ({where})", "0, plain models", limit, word)]
@@ -292,7 +292,7 @@ def _change_row(result: ChangeResult) -> tuple[str, ...]:
     if result.cover is None:
         return result.attack, f"not tried: {result.skipped}"
     cells = [
-        f"{each.psnr:.2f} ({-each.loss:+.2f})" if each.opens else "does not open"
+        f"{each.psnr:.2f} ({-each.loss:+z.2f})" if each.opens else "does not open"
         for each in (result.cover, *result.secrets)
     ]
     repeated = f", mean over {result.seeds} seeds" if result.seeds > 1 else ""
@@ -306,8 +306,8 @@ def pruning_verdicts(results: Sequence[ChangeResult]) -> list[Verdict]:
         if (result.attack, result.strength) == (PRUNING, PRUNED) and result.cover and result.secrets:
             opens = all(secret.opens for secret in result.secrets)
             loss, limit = max(secret.loss for secret in result.secrets), result.cover.loss + PRUNING_LOSS
-            value = f"secret {-loss:+.2f} dB" if opens else "the secret does not open"
-            beside, most = f"cover {-result.cover.loss:+.2f} dB", f"at most {PRUNING_LOSS} dB more"
+            value = f"secret {-loss:+z.2f} dB" if opens else "the secret does not open"
+            beside, most = f"cover {-result.cover.loss:+z.2f} dB", f"at most {PRUNING_LOSS} dB more"
             word: Word = "fine" if opens and loss <= limit else "missed"
             measure = f"loss of a random {PRUNED:.0%} of the Gaussians"
             verdicts.append(Verdict(measure, value, beside, most, word))
