@@ -65,7 +65,7 @@ def test_a_cover_with_stale_salts_opens_from_what_pruning_leaves() -> None:
 def test_salts_of_ordinary_models_are_fresh() -> None:
     cover = trained_like(3000)
     rows = salt_rows(cover, gaussian_ids(cover), Layout.of(cover))
-    assert usable_carriers(cover, 4)[rows].all()
+    assert usable_carriers(cover)[rows].all()
     stego = embed_derived(cover, [(keys(), b"secret")])
     assert np.array_equal(salt_rows(stego, gaussian_ids(stego), Layout.of(stego)), rows)
     assert not set(salts_of(cover)) & set(salts_of(stego))

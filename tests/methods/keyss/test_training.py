@@ -131,20 +131,26 @@ def test_targets() -> None:
     assert (foreign.image - expected).abs().max() <= 0.5 / 255 + 1e-6
 
 
-@pytest.mark.parametrize("evenly", ["scenes", "poses"])
-def test_poses_are_drawn_evenly(evenly: Any) -> None:
-    """Every scene, or every pose of every scene, once before one comes again (combined camera poses)."""
+def test_combined_poses() -> None:
+    """One pose for all scenes; every pose of every scene comes once before one returns."""
     scenes, models = three_scenes()
     scenes[1] = replace(scenes[1], train=scenes[1].train[:3])
     placed = [PlacedScene.of(*each, Similarity()) for each in zip(scenes, models, strict=True)]
-    run = KeyssTraining(placed, list(VECTORS[:2]), small("published", evenly=evenly), torch.device("cpu"))
+    run = KeyssTraining(placed, list(VECTORS[:2]), small("published", common_poses=1.0), torch.device("cpu"))
     poses = [(scene, index) for scene, each in enumerate(scenes) for index in range(len(each.train))]
     drawn = [run.sample_poses() for _ in poses]
     assert all(len(set(each)) == 1 for each in drawn)
-    if evenly == "poses":
-        assert sorted(each[0] for each in drawn) == poses
-    else:
-        assert all({each[0][0] for each in drawn[at : at + 3]} == {0, 1, 2} for at in range(0, 9, 3))
+    assert sorted(each[0] for each in drawn) == poses
+
+
+def test_each_scene_has_its_own_photos_between_common_poses() -> None:
+    run = _run(common_poses=0.25)
+    drawn = [run.sample_poses() for _ in range(400)]
+    photos = [pose for pose in drawn if [owner for owner, _ in pose] == [0, 1, 2]]
+    assert all(len(set(pose)) == 1 for pose in drawn if pose not in photos)
+    assert 240 <= len(photos) <= 350  # binomial: 300 +- 9
+    run = _run(common_poses=0.0, poses="cover")  # a scene whose poses do not count never has its own
+    assert {owner for _ in range(30) for owner, _ in run.sample_poses()} == {0}
 
 
 def test_start_leaves_room_for_growth() -> None:
@@ -204,8 +210,6 @@ def test_invalid_options() -> None:
     ):
         with pytest.raises(UsageError, match=message):
             KeyssOptions(**wrong)  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match="common_poses=1"):
-        replace(DESIGNS["published"], poses="cover", common_poses=0.5)
     for change in ({"beta_secret": 0.0}, {"decoder_rate": 0.0}, {"common_poses": 1.5}, {"start_share": 1.0}):
         with pytest.raises(UsageError, match=next(iter(change))):
             replace(DESIGNS["published"], **change)

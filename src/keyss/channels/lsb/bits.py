@@ -50,7 +50,7 @@ class Layout:
     @staticmethod
     def of(gaussians: Gaussians) -> Layout:
         """Without quaternions where half of them or more have unit length."""
-        words = _words(gaussians.quats)
+        words = bit_patterns(gaussians.quats)
         lengths = in_blocks(lambda start, stop: coarse_lengths(words[start:stop]), len(words), BLOCK)
         away = float(np.median(np.abs(np.concatenate(lengths) - 1))) if lengths else 1.0
         return Layout(gaussians.sh_degree, away > UNIT_TOLERANCE)
@@ -82,7 +82,7 @@ def gaussian_ids(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
         own = gaussians[start:stop]
         used = used_words(own)
         used[:, columns] &= ~LOW | np.uint32(1)
-        return blake2b_rows(np.concatenate([_words(own.means), used], axis=1), _PERSON)
+        return blake2b_rows(np.concatenate([bit_patterns(own.means), used], axis=1), _PERSON)
 
     return np.concatenate([np.zeros((0, ID_BYTES), np.uint8), *in_blocks(ids, len(gaussians), BLOCK)])
 
@@ -132,7 +132,7 @@ def used_words(gaussians: Gaussians) -> Words32:
 def group_words(gaussians: Gaussians) -> Iterator[Words32]:
     """The columns [N, C] of `used_words` by group; views where possible."""
     groups = gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:]
-    return map(_words, groups)
+    return map(bit_patterns, groups)
 
 
 @kernel
@@ -171,7 +171,7 @@ def _unpack(words: Any, columns: Any, depth: int, data: Any) -> None:
             bits &= (1 << held) - 1
 
 
-def _words(values: torch.Tensor) -> Words32:
+def bit_patterns(values: torch.Tensor) -> Words32:
     """[N, C] bit patterns; a view for contiguous float32 tensors on the CPU."""
     flat = values.detach().to("cpu", torch.float32).reshape(len(values), math.prod(values.shape[1:]))
     return flat.numpy().view(np.uint32)

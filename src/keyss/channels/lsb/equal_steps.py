@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from keyss.channels.lsb.bits import GEOMETRY, LEAST, QUATS, Layout, used_words
-from keyss.core.arrays import Flags, Integers, Words32, doubles
+from keyss.channels.lsb.bits import LEAST, Layout, bit_patterns
+from keyss.core.arrays import Doubles, Flags, Integers, Words32, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.core.neighbours import Neighbours
 from keyss.files.formats.common import morton_order
-from keyss.kernels.jit import kernel
+from keyss.kernels.jit import inline, kernel
 from keyss.kernels.parallel import in_blocks
 
 _NEIGHBOURS = 12  # siblings were among the nearest 10 in models of 20,000 to 200,000 Gaussians
@@ -31,7 +31,9 @@ _EQUAL = 3  # numbers
 _ROWS = 1 << 11  # that a thread takes at a time
 _SAMPLE = 8000  # Gaussians whose pairs of numbers are tested
 _DRAWS = 16
-_PARTS = np.array([1 / 16, 1 / 8, 1 / 4], np.float32)  # of a cell
+_PARTS = np.array([[1 / 16], [1 / 8], [1 / 4]])  # of a cell
+_LANES = 16  # of a group: as many as a processor compares at once
+_NAN, _EXPONENT = np.uint32(0x7FC00000), np.uint32(0x7F800000)
 
 
 class Steps:
@@ -42,32 +44,27 @@ class Steps:
 
     def __init__(self, gaussians: Gaussians, layout: Layout) -> None:
         means = np.nan_to_num(doubles(gaussians.means), posinf=0, neginf=0)
-        self.order = morton_order(means.astype(np.float32))  # neighbours are near in memory, too
-        means, count = means[self.order], len(means)
-        self.near = np.empty((count, min(_NEIGHBOURS, max(0, count - 1))), np.int32)
-        self.words = _no_words(gaussians, layout, count)  # in `order`
-        tree = Neighbours(means, self.near.shape[1] + 1) if self.near.size else None
+        self.order = morton_order(means.astype(np.float32))  # what neighbours share stays in the cache
+        self.near = np.empty((len(means), min(_NEIGHBOURS, max(0, len(means) - 1))), np.int32)
+        self.words = _words(gaussians, layout)
+        if self.near.size:
+            tree = Neighbours(means, self.near.shape[1] + 1)
 
-        def gather(start: int, stop: int) -> None:
-            used = used_words(gaussians[torch.from_numpy(self.order[start:stop])])
-            _fill(self.words, start, stop, used)
-            if tree:
-                self.near[start:stop] = tree.of(means[start:stop])[1][:, 1:]
+            def search(start: int, stop: int) -> None:
+                rows = self.order[start:stop]
+                self.near[rows] = tree.of(means[rows])[1][:, 1:]
 
-        in_blocks(gather, count, _ROWS)
+            in_blocks(search, len(means), _ROWS)
 
     def equal(self, depth: int) -> Flags:
         """Mask [N] of Gaussians that moved by equal amounts, by the bits that stay at a depth."""
         apart = np.zeros(len(self.order), bool)
 
         def mark(start: int, stop: int) -> None:
-            for words in self.words:
-                _mark(start, stop, self.near, words, depth, apart)
+            _mark(self.order[start:stop], self.near, *self.words, depth, apart)
 
-        in_blocks(mark, len(apart), _ROWS)
-        found = np.empty_like(apart)
-        found[self.order] = apart
-        return found
+        in_blocks(mark, len(apart), _ROWS, _mark)
+        return apart
 
     def chance(self, depth: int, usable: Flags) -> float:
         """p-value of low bits that follow from each other, for new low bits of the `usable` [N] Gaussians.
@@ -77,102 +74,119 @@ class Steps:
         """
         from scipy.special import pdtrc  # takes long to load
 
-        own = usable[self.order]
-        rows = np.flatnonzero(own)
+        rows, random, chances = self.order[usable[self.order]], np.random.default_rng(0), [1.0]
         rows = rows[:: max(1, len(rows) // _SAMPLE)]
-        near = np.concatenate([rows[:, None], self.near[rows]], axis=1)
-        at, places = np.unique(near, return_inverse=True)
-        places, random, chances = places.reshape(near.shape).astype(np.int32), np.random.default_rng(0), [1.0]
-        for every in self.words:
-            words, drawn = every[at], np.zeros(len(_PARTS), np.int64)
-            hits = _equal_pairs(places, words, words, depth)
+        found, count = np.empty((0, 7), np.uint32), 0
+        while count == len(found):
+            found = np.empty((2 * len(found) + len(rows) + 1, 7), np.uint32)
+            count = _pairs(rows, self.near, *self.words, depth, found)
+        harmonics = found[:count, 6] > 0
+        for kind in (~harmonics, harmonics):
+            words, pairs = found[:count, :4][kind], found[:count, 4:6][kind]
+            written = usable[np.tile(pairs, 2)]
+            hits, drawn = _hits(words, depth), np.zeros(len(_PARTS))
             for _ in range(_DRAWS):
-                drawn += _equal_pairs(places, words, redrawn(words, own[at], depth, random), depth)
+                drawn += _hits(redrawn(words, written, depth, random), depth)
             chances += pdtrc(hits - 1.0, np.maximum(drawn, 1) / _DRAWS)[hits > 0].tolist()
-        return min(1.0, min(chances) * len(self.words) * len(_PARTS))
+        return min(1.0, min(chances) * 2 * len(_PARTS))
 
 
 def moved_from_zero(gaussians: Gaussians, layout: Layout) -> Flags:
     """Mask [N] of Gaussians whose numbers moved by equal amounts away from zero, at the least depth."""
-    moved = np.zeros(len(gaussians), bool)
-
-    def mark(start: int, stop: int) -> None:
-        size = stop - start
-        words, none = _no_words(gaussians, layout, size), np.empty((size, 0), np.int32)
-        _fill(words, 0, size, used_words(gaussians[start:stop]))
-        for each in words:
-            _mark(0, size, none, each, LEAST, moved[start:stop])
-
-    in_blocks(mark, len(moved), _ROWS, _mark)
-    return moved
-
-
-def _no_words(gaussians: Gaussians, layout: Layout, count: int) -> list[Words32]:
-    """Arrays [count, groups, members] for the bit patterns of what may move by equal steps."""
-    words = [np.empty((count, 1 + layout.quats, 4), np.uint32)]
-    if gaussians.sh_degree:
-        words.append(np.empty((count, 3, (gaussians.sh_degree + 1) ** 2 - 1), np.uint32))
-    return words
-
-
-def _fill(words: list[Words32], start: int, stop: int, used: Words32) -> None:
-    """Set rows of `words` to those of `used` [R, F]."""
-    geometry = words[0][start:stop]
-    geometry[:, 0, :3], geometry[:, 0, 3] = used[:, :3], used[:, GEOMETRY - 1]
-    geometry[:, 1:] = used[:, None, QUATS]
-    for harmonics in words[1:]:
-        harmonics[start:stop] = used[:, GEOMETRY:].reshape(stop - start, -1, 3).transpose(0, 2, 1)
+    apart, none = np.zeros(len(gaussians), bool), np.empty((len(gaussians), 0), np.int32)
+    _mark(np.arange(len(apart)), none, *_words(gaussians, layout), LEAST, apart)
+    return apart
 
 
 def redrawn(words: Words32, chosen: Flags, depth: int, random: np.random.Generator) -> Words32:
-    """`words` [N, ...] with new low bits of the `chosen` [N] rows."""
+    """`words` [...] with new low bits of those `chosen` [...]."""
     mask, new = np.uint32((1 << depth) - 1 << 1), words.copy()
     drawn = random.integers(0, 1 << depth, words[chosen].shape, np.uint32) << np.uint32(1)
     new[chosen] = new[chosen] & ~mask | drawn
     return new
 
 
-def _equal_pairs(places: Integers, known: Words32, words: Words32, depth: int) -> Any:
-    counts = np.zeros(len(_PARTS), np.int64)
-    _count_equal(places, known, words, depth, _PARTS, counts)
+def _words(gaussians: Gaussians, layout: Layout) -> tuple[Words32, Words32]:
+    """Bit patterns of what may move by equal steps.
+
+    Scales and opacity [N, 4, 1] or, with quaternions, [N, 4, 2]; all coefficients of all colours [N, K, 3].
+    """
+    geometry = torch.cat([gaussians.log_scales, gaussians.opacity_logits[:, None]], dim=1)[:, :, None]
+    if layout.quats:
+        geometry = torch.cat([geometry, gaussians.quats[:, :, None]], dim=2)
+    shapes = geometry.shape, gaussians.sh.shape
+    return tuple(bit_patterns(x).reshape(shape) for x, shape in zip((geometry, gaussians.sh), shapes))
+
+
+def _hits(words: Words32, depth: int) -> Integers:
+    """Counts of rows (a, b, c, d) of `words` [M, 4] in which b - a and d - c agree up to _PARTS of a cell."""
+    numbers = words.view(np.float32).astype(np.float64)
+    steps = abs(numbers[:, 1::2] - numbers[:, ::2])
+    cells = (words & _EXPONENT).view(np.float32).max(axis=1) * 2.0 ** (depth + 1 - 23)
+    counts: Integers = (abs(steps[:, 1] - steps[:, 0]) < _PARTS * cells).sum(axis=1)
     return counts
 
 
-@kernel
-def _mark(start: int, stop: int, near: Any, words: Any, depth: int, apart: Any) -> None:
-    """Set `apart` [N] for pairs of rows `start` to `stop` and their neighbours in `near` [N, K], or zero."""
-    size = words.shape[2]
-    low, half, exponent = np.uint32((1 << depth + 1) - 1), np.uint32(1 << depth), np.uint32(0x7F800000)
+@inline
+def _read(geometry: Any, sh: Any, row: Any, words: Any) -> None:
+    """Set `words` [groups, _LANES] to the numbers of a Gaussian."""
+    quats = geometry.shape[2]
+    for group in range(quats):
+        for at in range(4):
+            words[group, at] = geometry[row, at, group]
+    for at in range(1, sh.shape[1]):  # constant colours are never written
+        for colour in range(len(words) - quats):
+            words[quats + colour, at - 1] = sh[row, at, colour]
+
+
+@inline
+def _compare(x: Any, y: Any, depth: Any, known: Any, steps: Any, cells: Any) -> None:
+    """Set `steps` [groups, _LANES] to the differences of x and y by the bits that stay at a depth.
+
+    `cells`: the larger one of x and y. `known` [3, groups, _LANES]: scratch memory.
+    """
+    low, half = np.uint32((1 << depth + 1) - 1), np.uint32(1 << depth)
     share = np.float32(2.0 ** (depth + 1 - 23))
-    x, y, top = np.empty(size, np.uint32), np.zeros(size, np.uint32), np.empty(size, np.uint32)
-    own, its, span = x.view(np.float32), y.view(np.float32), top.view(np.float32)
-    steps = np.empty(size, np.float32)
-    for one in range(start, stop):
-        for place in range(near.shape[1] + 1):
-            other = one if place == 0 else near[one, place - 1]
-            if (apart[one] and apart[other]) or (place > 0 and other == one):
+    numbers = known.view(np.float32)
+    for group in range(len(x)):
+        for at in range(_LANES):
+            a, b = x[group, at], y[group, at]
+            known[0, group, at], known[1, group, at] = a & ~low | half, b & ~low | half
+            known[2, group, at] = max(a & _EXPONENT, b & _EXPONENT)
+        for at in range(_LANES):
+            steps[group, at] = abs(numbers[0, group, at] - numbers[1, group, at])
+            cells[group, at] = numbers[2, group, at] * share
+
+
+@kernel
+def _mark(rows: Any, near: Any, geometry: Any, sh: Any, depth: int, apart: Any) -> None:
+    """Set `apart` [N] for pairs of a row and one of its neighbours in `near` [N, K], or zero."""
+    groups = geometry.shape[2] + 3 * (sh.shape[1] > 1)
+    x = np.full((groups, _LANES), _NAN, np.uint32)  # unused lanes are equal to nothing
+    y, known = np.zeros((groups, _LANES), np.uint32), np.empty((3, groups, _LANES), np.uint32)
+    steps, cells = np.empty((groups, _LANES), np.float32), np.empty((groups, _LANES), np.float32)
+    for one in rows:
+        _read(geometry, sh, one, x)
+        y[:] = 0
+        for place in range(-1, near.shape[1]):
+            other = one if place < 0 else near[one, place]
+            if (apart[one] and apart[other]) or (place >= 0 and other == one):
                 continue
             seen = False  # a pair of mutual neighbours is judged once
             for each in range(near.shape[1] if other < one else 0):
                 seen |= near[other, each] == one
             if seen:
                 continue
-            for group in range(words.shape[1]):
-                for at in range(size):
-                    x[at] = words[one, group, at]
-                    y[at] = words[other, group, at] if place > 0 else np.uint32(0)
-                for at in range(size):
-                    top[at] = max(x[at] & exponent, y[at] & exponent)
-                    x[at] = x[at] & ~low | half
-                    y[at] = y[at] & ~low | half
-                for at in range(size):
-                    steps[at] = abs(own[at] - its[at])
-                    span[at] = span[at] * share
-                most = 0
-                for at in range(size):
-                    agree = 0
-                    for each in range(size):
-                        agree += abs(steps[at] - steps[each]) <= max(span[at], span[each])
+            if place >= 0:
+                _read(geometry, sh, other, y)
+            _compare(x, y, depth, known, steps, cells)
+            for group in range(groups):
+                most = np.int32(0)
+                for at in range(_LANES):
+                    agree = np.int32(0)
+                    for each in range(_LANES):
+                        cell = max(cells[group, at], cells[group, each])
+                        agree += np.int32(abs(steps[group, at] - steps[group, each]) <= cell)
                     most = max(most, agree)
                 if most >= _EQUAL:
                     apart[one] = apart[other] = True
@@ -180,40 +194,34 @@ def _mark(start: int, stop: int, near: Any, words: Any, depth: int, apart: Any) 
 
 
 @kernel
-def _count_equal(places: Any, known: Any, words: Any, depth: int, parts: Any, counts: Any) -> None:
-    """Count pairs of numbers whose differences between rows of `words` agree to `parts` of a cell.
+def _pairs(rows: Any, near: Any, geometry: Any, sh: Any, depth: int, found: Any) -> int:
+    """List pairs of numbers that differ by equal steps between `rows` and neighbours; returns how many.
 
-    Of those that agree in `known`, by the bits that stay. `places` [R, 1 + K]: rows and their neighbours.
+    `found` [M, 7]: first number of row and neighbour, second number, row and neighbour, 1 for harmonics. Lists
+    at most M. Steps of up to two cells are small by chance.
     """
-    size = words.shape[2]
-    low, half, exponent = np.uint32((1 << depth + 1) - 1), np.uint32(1 << depth), np.uint32(0x7F800000)
-    share = np.float32(2.0 ** (depth + 1 - 23))
-    x, y, top = np.empty(size, np.uint32), np.empty(size, np.uint32), np.empty(size, np.uint32)
-    own, its, span = x.view(np.float32), y.view(np.float32), top.view(np.float32)
-    coarse, exact = np.empty(size, np.float32), np.empty(size, np.float64)
-    for row in range(len(places)):
-        one = places[row, 0]
-        for place in range(1, places.shape[1]):
-            other = places[row, place]
+    groups, count = geometry.shape[2] + 3 * (sh.shape[1] > 1), 0
+    x, y = np.full((groups, _LANES), _NAN, np.uint32), np.zeros((groups, _LANES), np.uint32)
+    known = np.empty((3, groups, _LANES), np.uint32)
+    steps, cells = np.empty((groups, _LANES), np.float32), np.empty((groups, _LANES), np.float32)
+    for one in rows:
+        _read(geometry, sh, one, x)
+        for other in near[one]:
             if other <= one:  # each pair counts once
                 continue
-            for group in range(words.shape[1]):
-                for at in range(size):
-                    x[at], y[at] = words[one, group, at], words[other, group, at]
-                for at in range(size):
-                    exact[at] = abs(np.float64(own[at]) - np.float64(its[at]))
-                    x[at], y[at] = known[one, group, at], known[other, group, at]
-                for at in range(size):
-                    top[at] = max(x[at] & exponent, y[at] & exponent)
-                    x[at] = x[at] & ~low | half
-                    y[at] = y[at] & ~low | half
-                for at in range(size):
-                    coarse[at] = abs(own[at] - its[at])
-                    span[at] = span[at] * share
-                for at in range(size):
+            _read(geometry, sh, other, y)
+            _compare(x, y, depth, known, steps, cells)
+            for group in range(groups):
+                for at in range(_LANES):
                     for each in range(at):
-                        cell = max(span[at], span[each])
-                        if abs(coarse[at] - coarse[each]) <= cell and coarse[at] > 2 * cell:
-                            off = abs(exact[at] - exact[each])
-                            for part in range(len(parts)):
-                                counts[part] += off < parts[part] * cell
+                        cell = max(cells[group, at], cells[group, each])
+                        step = steps[group, at]
+                        if abs(step - steps[group, each]) <= cell and step > 2 * cell:
+                            if count == len(found):
+                                return count
+                            row = found[count]
+                            row[0], row[1] = x[group, at], y[group, at]
+                            row[2], row[3] = x[group, each], y[group, each]
+                            row[4], row[5], row[6] = one, other, group >= geometry.shape[2]
+                            count += 1
+    return count

@@ -71,6 +71,7 @@ _SATURATED = np.uint32(0x41800000), np.uint32(0x80000000)
 _PRUNED = np.float32(math.log(0.005 / 0.995)).view(np.uint32) | LOW  # the logit of 0.005, without low bits
 _MIN_USABLE = 0.05  # share of the Gaussians of a cover
 _LARGE_ENOUGH = 118  # biased exponent: optimisers with large last steps leave zeros in numbers below 2^-9
+_FIRST = 1 << 12  # Gaussians of the smallest IDs, of which most models have enough for salts
 _SETS_BY_CHANCE = 0.1  # maximum expected number of sets of equal values by chance
 _SAMPLE = 20_000  # Gaussians whose bits are tested
 _LARGE = 10 * _SAMPLE  # Gaussians of a cover whose sample is tested first
@@ -82,36 +83,34 @@ class Carriers:
     """The Gaussians of a cover that may be written, by depth."""
 
     ids: Bytes  # [N, 16] of all Gaussians
-    usable: dict[int, Flags]  # [N] masks by depth, of the depths at which new low bits do not show
+    usable: dict[int, Flags]  # [N] the same mask for each depth at which new low bits do not show
 
     @staticmethod
-    def of(gaussians: Gaussians, layout: Layout, depths: tuple[int, ...] = DEPTHS) -> Carriers:
-        """Raises UsageError, with what shows, if new low bits would show even at the first of `depths`.
+    def of(gaussians: Gaussians, layout: Layout) -> Carriers:
+        """Raises UsageError, with what shows, if new low bits would show even at the least depth.
 
-        A sample of a large cover is tested first: the whole takes a second for each 40,000 Gaussians.
+        A sample of a large cover is tested first: the whole takes a second for each 200,000 Gaussians.
         """
         if len(gaussians) > _LARGE:
             sample = gaussians[:: len(gaussians) // _SAMPLE]
-            Carriers.of(sample, Layout.of(sample), depths[:1])
+            Carriers.of(sample, Layout.of(sample))
         ids = gaussian_ids(gaussians, layout)
         steps = Steps(gaussians, layout)
-        fine, usable = _without_copies(gaussians, layout, ids), dict[int, Flags]()
-        for depth in depths:
-            usable[depth] = fine & ~steps.equal(depth)
-            if depth == depths[0]:
-                fine &= _large_enough(gaussians, layout, usable[depth])
-                usable[depth] &= fine
-            if told := _what_tells(gaussians, layout, usable[depth], depth, steps):
-                del usable[depth]
-                if not usable:
+        usable = _without_copies(gaussians, layout, ids) & ~steps.equal(DEEPEST)
+        usable &= _large_enough(gaussians, layout, usable)
+        written = dict[int, Flags]()
+        for depth in DEPTHS:
+            if told := _what_tells(gaussians, layout, usable, depth, steps):
+                if depth == LEAST:
                     raise UsageError(told)
                 break
-        return Carriers(ids, usable)
+            written[depth] = usable
+        return Carriers(ids, written)
 
 
-def usable_carriers(gaussians: Gaussians, depth: int = DEEPEST) -> Flags:
-    """Mask [N] of the usable Gaussians at a depth. Raises UsageError as `Carriers.of`."""
-    return Carriers.of(gaussians, Layout.of(gaussians), (depth,)).usable[depth]
+def usable_carriers(gaussians: Gaussians) -> Flags:
+    """Mask [N] of the usable Gaussians. Raises UsageError as `Carriers.of`."""
+    return Carriers.of(gaussians, Layout.of(gaussians)).usable[LEAST]
 
 
 def _what_tells(gaussians: Gaussians, layout: Layout, usable: Flags, depth: int, steps: Steps) -> str:
@@ -165,16 +164,21 @@ def chance_of_bits(words: Words32, bits: int) -> float:
 
 def salt_rows(gaussians: Gaussians, ids: Bytes, layout: Layout) -> Integers:
     """Rows of the salts' Gaussians, at most SALTS, in the order of the salts; `ids` [N, 16]."""
-    late = np.where(moved_from_zero(gaussians, layout), np.uint64(255), _smallness(gaussians, layout))
-    keys = late << np.uint64(56) | ids[:, :8].copy().view(">u8")[:, 0].astype(np.uint64) >> np.uint64(8)
+    numbers = ids[:, :8].copy().view(">u8")[:, 0].astype(np.uint64)
+    rows = np.argpartition(numbers, _FIRST)[:_FIRST] if len(ids) > _FIRST else np.arange(len(ids))
+    late = _lateness(gaussians[torch.from_numpy(rows)], layout)
+    if (late == 0).sum() < SALTS:  # of the smallest IDs too few
+        rows, late = np.arange(len(ids)), _lateness(gaussians, layout)
+    keys = late << np.uint64(56) | numbers[rows] >> np.uint64(8)
     best = np.argpartition(keys, SALTS - 1)[:SALTS] if len(keys) > SALTS else np.arange(len(keys))
-    low = read_low_bits(gaussians[torch.from_numpy(best)], LEAST, layout)
-    order = sorted(range(len(best)), key=lambda i: (late[best[i]], ids[best[i]].tobytes(), low[i].tobytes()))
-    return best[order]
+    low = read_low_bits(gaussians[torch.from_numpy(rows[best])], LEAST, layout)
+    places = [(late[each], ids[rows[each]].tobytes(), own.tobytes()) for each, own in zip(best, low, strict=True)]
+    return rows[best[sorted(range(len(best)), key=places.__getitem__)]]
 
 
-def _smallness(gaussians: Gaussians, layout: Layout) -> Words:
-    """[N] octaves by which the smallest even number lies below _LARGE_ENOUGH; 0 for larger ones."""
+def _lateness(gaussians: Gaussians, layout: Layout) -> Words:
+    """[N] 255 for Gaussians that moved by equal steps away from zero; else the octaves by which the smallest
+    even number lies below _LARGE_ENOUGH, 0 for larger ones."""
 
     def work(start: int, stop: int) -> Words:
         used = used_words(gaussians[start:stop])[:, layout.columns]
@@ -182,7 +186,8 @@ def _smallness(gaussians: Gaussians, layout: Layout) -> Words:
         smallness: Words = below.max(axis=1, initial=0).astype(np.uint64)
         return smallness
 
-    return np.concatenate([np.zeros(0, np.uint64), *in_blocks(work, len(gaussians), BLOCK)])
+    small = np.concatenate([np.zeros(0, np.uint64), *in_blocks(work, len(gaussians), BLOCK)])
+    return np.where(moved_from_zero(gaussians, layout), np.uint64(255), small)
 
 
 def salt(carrier_id: Bytes, low: Bytes) -> bytes:

@@ -24,10 +24,10 @@ class BaselineOptions(JointOptions):
     common_poses: Annotated[
         float,
         CommandLineOption(
-            "Share of steps that render both scenes from one pose, 0 to 1; the papers': 1.",
+            "Share of steps that render both scenes from one pose, 0 to 1, as in KeySS.",
             metavar="SHARE",
         ),
-    ] = 1.0
+    ] = Design.common_poses
     network_rate: float = 5e-4  # AdamW; follows the length of the run like KeySS's
 
     def __post_init__(self) -> None:

@@ -26,7 +26,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import torch
 
-from keyss.core.arrays import Doubles, Flags, Floats, Integers, Numbers, doubles
+from keyss.core.arrays import Doubles, Flags, Integers, Numbers, doubles
 from keyss.core.errors import InputError
 from keyss.core.gaussians import MAX_COORDINATE, MAX_LOG_SCALE, OPPONENT, Gaussians
 from keyss.files.formats.common import morton_order, with_largest_w
@@ -40,6 +40,7 @@ _HEAD = struct.Struct("<IB5f6ff")
 BLOCK = 1 << 13  # Gaussians; half as many take 0.3 % more bytes, twice as many 0.2 % less
 _SAMPLE = BLOCK // 4  # Gaussians of each block that are coded to estimate the size of a large model
 _EXACT = 8 * BLOCK  # maximum Gaussians of a model whose size is not estimated
+_TYPICAL = 1 << 16  # Gaussians that medians are taken of
 _POSITION_STEP = 0.03  # relative to the median size of Gaussians
 _DIFFERENCES = np.array([1.0, 1.5, 1.5])  # steps of brightness and differences of constant colours
 _PER_OCTAVE = 0.5 / math.log(2)  # half octaves of the step
@@ -116,19 +117,18 @@ class _Encoder:
     def of(model: Gaussians, precision: Precision | None) -> _Encoder:
         model = model.detach().to("cpu")
         order = morton_order(model.means.numpy())
-        coder = _Encoder(
-            model, order, model.overflow.numpy(), [], (precision or Precision.usual(model)).steps
-        )
+        some = order[:: 1 + len(order) // _TYPICAL]
         middle = [
-            *map(np.median, model.means.numpy().T),
-            np.median(model.log_scales),
-            np.median(model.opacity_logits),
+            *np.median(model.means.numpy()[some], axis=0),
+            np.median(model.log_scales.numpy()[some]),
+            np.median(model.opacity_logits.numpy()[some]),
         ]
         limits = [*[MAX_COORDINATE] * 3, MAX_LOG_SCALE, _MAX_LOGIT]
         centres = [float(np.clip(each, -most, most)) for each, most in zip(middle, limits, strict=True)]
-        coder = replace(coder, centres=centres)
-        typical = np.median(np.concatenate(in_blocks(coder._weight, len(model), BLOCK)))
-        return replace(coder, typical=float(np.float32(typical)))
+        steps = (precision or Precision.usual(model)).steps
+        coder = _Encoder(model, order, model.overflow.numpy(), centres, steps)
+        _, log_scales, logits, _ = _uniform_numbers(coder._uniform_codes(some), centres, steps)
+        return replace(coder, typical=float(np.float32(np.median(_weight(log_scales, logits)))))
 
     @property
     def head(self) -> bytes:
@@ -149,11 +149,6 @@ class _Encoder:
             harmonics = _to_opponents(self.model.sh.numpy()[rows, 1:] / harmonics_steps[:, None])
         codes[:, 13:] = _round(harmonics.reshape(len(rows), -1))
         return entropy.encode(codes, *_columns(self.model.sh_degree))
-
-    def _weight(self, start: int, stop: int) -> Floats:
-        codes = self._uniform_codes(self.order[start:stop])
-        _, log_scales, logits, _ = _uniform_numbers(codes, self.centres, self.steps)
-        return _weight(log_scales, logits).astype(np.float32)
 
     def _uniform_codes(self, rows: Integers) -> Doubles:
         """Codes [R, 10] of means, log scales, opacity logits and constant colours.

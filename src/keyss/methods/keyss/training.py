@@ -135,12 +135,11 @@ class KeyssTraining(TrainingRun):
         self.backgrounds = [placed.scene.background.to(device) for placed in scenes]
         self.growing = scene_indices(design.densification, count)
         views = [len(placed.scene.train) for placed in scenes]
-        owners = scene_indices(design.poses, count)
-        times = [1 if design.evenly == "scenes" else views[owner] for owner in owners]
-        self.owners = [owner for owner, every in zip(owners, times, strict=True) for _ in range(every)]
-        self.shuffles["owners"] = Shuffle(len(self.owners), self.generator)
-        for scene in range(count):
-            self.shuffles[f"poses.{scene}"] = Shuffle(views[scene], self.generator)
+        self.owners = scene_indices(design.poses, count)
+        self.combined = [(owner, index) for owner in self.owners for index in range(views[owner])]
+        self.shuffles["combined"] = Shuffle(len(self.combined), self.generator)
+        for scene in self.owners:
+            self.shuffles[f"photos.{scene}"] = Shuffle(views[scene], self.generator)
         self.extent = scenes[0].scene.extent
         cameras = [view.camera for placed in scenes for view in placed.scene.train]
         self.schedule = Schedule(self.fit, cameras, self.extent)
@@ -186,12 +185,14 @@ class KeyssTraining(TrainingRun):
         self.network_optimizer.param_groups[0]["lr"] = rate
 
     def sample_poses(self) -> list[Pose]:
-        """The training pose for each scene: one of any scene for all (combined camera poses)."""
-        count = len(self.scenes)
-        if float(torch.rand((), generator=self.generator)) < self.design.common_poses:
-            owner = self.owners[self.shuffles["owners"].sample()]
-            return [(owner, self.shuffles[f"poses.{owner}"].sample())] * count
-        return [(scene, self.shuffles[f"poses.{scene}"].sample()) for scene in range(count)]
+        """The training pose for each scene: one of any scene for all (combined camera poses), or its own."""
+        shared = float(torch.rand((), generator=self.generator)) < self.design.common_poses
+        alone = [not shared and scene in self.owners for scene in range(len(self.scenes))]
+        common = [] if all(alone) else [self.combined[self.shuffles["combined"].sample()]]
+        return [
+            (scene, self.shuffles[f"photos.{scene}"].sample()) if own else common[0]
+            for scene, own in enumerate(alone)
+        ]
 
     def wrong_key(self) -> Tensor | None:
         """[K] vector of a wrong key, sampled at every step."""
