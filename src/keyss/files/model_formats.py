@@ -47,9 +47,9 @@ PLY = FORMATS[1]
 def format_of(path: Path | str) -> ModelFormat | None:
     """The format of the suffix, or None."""
     name = Path(path).name.lower()
-    return next((each for each in (*FORMATS, DECODED) if name.endswith(each.suffixes)), None)
+    return next((entry for entry in (*FORMATS, DECODED) if name.endswith(entry.suffixes)), None)
 
 
 def known_suffixes() -> str:
     """The suffixes of all formats, for messages."""
-    return ", ".join(suffix for each in FORMATS for suffix in each.suffixes)
+    return ", ".join(suffix for entry in FORMATS for suffix in entry.suffixes)

@@ -177,7 +177,7 @@ def _read(file: BinaryIO, name: str) -> Gaussians:
     """The model in an open file, in the format of its first bytes, which must not contradict `name`."""
     start = file.read(START_BYTES)
     file.seek(0)
-    fitting = [] if is_foreign_archive(start) else [each for each in FORMATS if each.starts(start)]
+    fitting = [] if is_foreign_archive(start) else [entry for entry in FORMATS if entry.starts(start)]
     named = format_of(name)
     if named in fitting or (named and start and not fitting and not (named.magic or named.archive)):
         return _read_as(named, file)

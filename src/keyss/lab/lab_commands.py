@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -89,7 +90,7 @@ def audit(
         reporter=progress.reporter(),
     )
     if progress.level >= 0:
-        rows = [(each.measure, each.value, each.beside, each.limit, each.word) for each in result.verdicts]
+        rows = [astuple(verdict) for verdict in result.verdicts]
         print_table(("measure", "measured", "baseline or control", "limit", "verdict"), rows, texts=5)
         Console().print(headline(result.verdicts), highlight=False)
     print_files(
@@ -285,10 +286,10 @@ def sweep(
         "private/master-key.txt": "the key from which those of the trials are derived",
     }
     print_files(out, described)
-    failed = [each for each in outcomes if each.error]
+    failed = [outcome for outcome in outcomes if outcome.error]
     progress.say(f"{len(outcomes) - len(failed)} of {len(outcomes)} trials are done")
-    for each in failed:
-        print(f"failed: {each.name}: {each.error}")
+    for outcome in failed:
+        print(f"failed: {outcome.name}: {outcome.error}")
     if failed:
         raise InputError(f"{len(failed)} of {len(outcomes)} trials failed")
 

@@ -132,10 +132,10 @@ def parameters(subject: Subject, seed: int, progress: Progress) -> tuple[Section
         (name, *(text_of(value, ".3g") for value in (one.distance, one.control, one.ratio, one.original)))
         for name, one in distances.items()
     ]
-    means = {name: fmean(each[name] for each in map(asdict, between)) for name in asdict(sinkhorn)}
+    means = {name: fmean(control[name] for control in map(asdict, between)) for name in asdict(sinkhorn)}
     sinkhorn_rows = [(name, f"{one:.4f}", f"{means[name]:.4f}") for name, one in asdict(sinkhorn).items()]
     sinkhorn_rows.append(("composite score (eq. 10)", f"{score:.2f}", "–"))
-    auc_rows = [(name, ", ".join(map(auc_text, each))) for name, each in aucs.items()]
+    auc_rows = [(name, ", ".join(map(auc_text, values))) for name, values in aucs.items()]
     tables = [
         Table(heads, tuple(distance_rows)),
         Table(("classifier", "AUC, with 95 % interval"), tuple(auc_rows)),
@@ -150,17 +150,17 @@ def parameters(subject: Subject, seed: int, progress: Progress) -> tuple[Section
 def published_distance(subject: Subject, stego: Gaussians) -> tuple[Sinkhorn3D, float]:
     """3D-Sinkhorn from the cover's plain model to `stego`, and the composite score."""
     distance, metrics = sinkhorn_3d(subject.original, stego), subject.run.metrics
-    secret = fmean(each.psnr for each in metrics.secrets)
+    secret = fmean(secret.psnr for secret in metrics.secrets)
     return distance, composite_score(metrics.cover.psnr, secret, distance.sum)
 
 
 def distance_verdicts(distances: Mapping[str, AttributeDistance]) -> list[Verdict]:
     """The attribute that is furthest from its limit; none if no distance has a ratio."""
     limits = {
-        name: max(DISTANCE_RATIO, (1 + TOLERANCE) * (each.original or 0.0))
-        for name, each in distances.items()
+        name: max(DISTANCE_RATIO, (1 + TOLERANCE) * (distance.original or 0.0))
+        for name, distance in distances.items()
     }
-    ratios = {name: each.ratio for name, each in distances.items() if each.ratio is not None}
+    ratios = {name: distance.ratio for name, distance in distances.items() if distance.ratio is not None}
     if not ratios:
         return []
     name = max(ratios, key=lambda name: ratios[name] / limits[name])
@@ -292,8 +292,8 @@ def _change_row(result: ChangeResult) -> tuple[str, ...]:
     if result.cover is None:
         return result.attack, f"not tried: {result.skipped}"
     cells = [
-        f"{each.psnr:.2f} ({-each.loss:+z.2f})" if each.opens else "does not open"
-        for each in (result.cover, *result.secrets)
+        f"{quality.psnr:.2f} ({-quality.loss:+z.2f})" if quality.opens else "does not open"
+        for quality in (result.cover, *result.secrets)
     ]
     repeated = f", mean over {result.seeds} seeds" if result.seeds > 1 else ""
     return result.attack, f"{result.strength:g} {result.unit}{repeated}", *cells

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import astuple
 from pathlib import PurePath
 
 from keyss.lab.audits.parts import PARTS
@@ -37,7 +38,7 @@ def _lines(audit: Audit, pictures: str) -> Iterator[str]:
     }
     yield from (f"- {name}: {_escaped(value)}" for name, value in facts.items() if value)
     yield f"\n## Verdicts\n\n{_escaped(headline(audit.verdicts))}\n"
-    rows = [(each.measure, each.value, each.beside, each.limit, each.word) for each in audit.verdicts]
+    rows = [astuple(verdict) for verdict in audit.verdicts]
     if rows:
         yield from _table(("measure", "measured", "baseline or control", "limit", "verdict"), rows)
         yield _WORDS

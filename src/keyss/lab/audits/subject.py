@@ -108,7 +108,7 @@ class Subject:
         if self.run.config.models_given[0]:  # the run's maximum is not for this model
             config = replace(config, max_gaussians=max(count, 16))
         configs = [replace(config, seed=seed) for seed in seeds]
-        self.controls = [self._fit_control(each, folder, reporter).to(self.device) for each in configs]
+        self.controls = [self._fit_control(control, folder, reporter).to(self.device) for control in configs]
 
     def _fit_control(self, config: FitConfig, folder: RunFolder, reporter: Reporter) -> Gaussians:
         """Fit a plain model of the cover, or read it from the run's folder."""

@@ -72,13 +72,13 @@ def secrecy(subject: Subject) -> Numbers:
     if subject.standard:
         numbers["stealth"] = judge(stego, controls).least
         with suppress(UsageError):  # too few Gaussians, or all in a corner
-            numbers["classifier"] = fmean(two_sample_auc(each, stego).auc for each in controls)
+            numbers["classifier"] = fmean(two_sample_auc(control, stego).auc for control in controls)
     return numbers
 
 
 def survival(subject: Subject) -> Numbers:
     """Changes in dB of cover and secret by pruning, conversion and purification; none for lost secrets."""
-    tools = {(each.format, each.tool): each for each in converters()}
+    tools = {(converter.format, converter.tool): converter for converter in converters()}
     changes = {"pruned": random_pruning(_LOST)}
     if subject.standard:
         changes |= {format: tools[format, tool].change() for format, tool in CONVERSIONS.items()}

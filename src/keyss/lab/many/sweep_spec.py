@@ -76,7 +76,7 @@ def read_spec(path: Path) -> SweepSpec:
         raise InputError(f"{path}: expected YAML of a sweep: {' '.join(str(error).split())}") from error
     most = min(registry.get(entry.method).max_secrets for entry in spec.methods)
     pairs = [_resolve_pair(path, index, pair, most) for index, pair in enumerate(spec.pairs)]
-    methods = [msgspec.structs.replace(each, name=each.name or each.method) for each in spec.methods]
+    methods = [msgspec.structs.replace(method, name=method.name or method.method) for method in spec.methods]
     spec = msgspec.structs.replace(spec, pairs=tuple(pairs), methods=tuple(methods))
     unique: dict[str, list[Any]] = {"seeds": list(spec.seeds)}
     unique |= {"pairs": [each.name for each in spec.pairs], "methods": [each.name for each in spec.methods]}
@@ -124,9 +124,9 @@ def _resolve_pair(path: Path, index: int, pair: Pair, most: int) -> Pair:
         pair,
         name=pair.name or "-".join(Path(source).stem for source in (pair.cover, *pair.secrets)),
         cover=absolute("cover", pair.cover),
-        secrets=tuple(absolute("secrets", each) for each in pair.secrets),
+        secrets=tuple(absolute("secrets", source) for source in pair.secrets),
         cover_model=pair.cover_model and absolute("cover_model", pair.cover_model),
-        secret_models=tuple(absolute("secret_models", each) for each in pair.secret_models),
+        secret_models=tuple(absolute("secret_models", source) for source in pair.secret_models),
     )
 
 

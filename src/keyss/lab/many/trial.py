@@ -68,16 +68,16 @@ class Trial:
     def identity(self) -> str:
         """SHA-256 (hexadecimal) of all that the run depends on: not of its measures."""
         same = replace(self, name="", measures=())
-        models = [each for each in self.models if each and os.path.isabs(each)]
+        models = [path for path in self.models if path and os.path.isabs(path)]
         inputs = [self.cover, *self.secrets, *models]
-        times = {each: os.stat(each).st_mtime_ns if os.path.exists(each) else 0 for each in inputs}
+        times = {path: os.stat(path).st_mtime_ns if os.path.exists(path) else 0 for path in inputs}
         return hashlib.sha256(record_bytes(same) + msgspec.json.encode(times)).hexdigest()
 
     @property
     def needs(self) -> list[str]:
         """Names of the trials whose models it uses."""
-        models = [each for each in (*self.models, *self.controls) if each and not os.path.isabs(each)]
-        return [Path(each).parts[1] for each in models]
+        models = [path for path in (*self.models, *self.controls) if path and not os.path.isabs(path)]
+        return [Path(path).parts[1] for path in models]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,12 +110,13 @@ def run_trial(trial: Trial, folder: Path, reporter: Reporter) -> Result:
     write_bytes(folder / TRIAL, record_bytes(trial))
     if before is None:
         before = Result(seconds=0.0, numbers=_fit_or_hide(trial, folder, reporter))
-    missing = [each for each in trial.measures if each not in before.measures]
+    missing = [measure for measure in trial.measures if measure not in before.measures]
     measured = _measure(trial, missing, folder, reporter) if missing else {}
     result = Result(
         seconds=round(time.monotonic() - start, 1),
-        numbers=before.numbers | {name: each for name, each in measured.items() if not isinstance(each, str)},
-        notes=before.notes | {name: each for name, each in measured.items() if isinstance(each, str)},
+        numbers=before.numbers
+        | {name: value for name, value in measured.items() if not isinstance(value, str)},
+        notes=before.notes | {name: value for name, value in measured.items() if isinstance(value, str)},
         measures=tuple(dict.fromkeys((*before.measures, *trial.measures))),
     )
     write_bytes(folder / RESULT, record_bytes(result))
@@ -175,14 +176,14 @@ def flat(record: Any, prefix: str = "") -> dict[str, float]:
     if isinstance(record, list | tuple):
         record = dict(enumerate(record, start=1))
     numbers: dict[str, float] = {}
-    for name, each in record.items() if isinstance(record, dict) else ():
-        numbers |= flat(each, f"{prefix}.{name}" if prefix else str(name))
+    for name, value in record.items() if isinstance(record, dict) else ():
+        numbers |= flat(value, f"{prefix}.{name}" if prefix else str(name))
     return numbers
 
 
 def _hide_arguments(trial: Trial, folder: Path, keys: list[str]) -> dict[str, Any]:
     """The arguments of `hide`, without models that do not exist yet."""
-    places = [each and _place(folder, each) for each in trial.models]
+    places = [path and _place(folder, path) for path in trial.models]
     cover, *models = (place if place and place.exists() else None for place in places)
     blank = [""] * len(trial.secrets)  # for methods without keys
     return {
@@ -216,10 +217,12 @@ def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -
     if others := [name for name in names if name not in PARTS]:
         device = resolve_device(trial.device)
         with reporter.waiting(f"opening {trial.name}", seconds_for("reveal", stego_in(folder / RUN))):
-            controls = [read_model(_place(folder, each)).to(device) for each in trial.controls]
+            controls = [read_model(_place(folder, path)).to(device) for path in trial.controls]
             subject = Subject(opened_run(trial, folder), device, controls)
             view = subject.view_seconds
         for name in others:
             with reporter.waiting(f"{trial.name}: {name}", _seconds_of([name], view, len(subject.stego))):
-                found |= {f"{name}.{each}": value for each, value in MEASURES[name].numbers(subject).items()}
+                found |= {
+                    f"{name}.{measure}": value for measure, value in MEASURES[name].numbers(subject).items()
+                }
     return found

@@ -71,8 +71,8 @@ def judge(
     others = [stealth_statistics(model) for model in controls]
     rows = compare_statistics(own, others)
     of_controls = (
-        compare_statistics(each, others[:index] + others[index + 1 :])
-        for index, each in enumerate(others)
+        compare_statistics(control, others[:index] + others[index + 1 :])
+        for index, control in enumerate(others)
         if len(others) > 2
     )
     return StealthResult(
@@ -90,9 +90,9 @@ def compare_statistics(
     """The statistics that all models have, the least likely first."""
     models = [own, *controls]
     samples = {
-        name: [each[name] for each in controls]
+        name: [control[name] for control in controls]
         for name in own
-        if all(name in each and math.isfinite(each[name].value) for each in models)
+        if all(name in model and math.isfinite(model[name].value) for model in models)
     }
     # Variance of the statistics of bits between trainings / sampling variance.
     ratios = [
@@ -103,7 +103,7 @@ def compare_statistics(
     excess = max(1.0, float(np.mean(ratios))) if ratios else None
     rows = []
     for name, others in samples.items():
-        values = [each.value for each in others]
+        values = [statistic.value for statistic in others]
         p = _p(own[name], others, excess if name.startswith("bits: ") else None)
         rows.append(JudgedStatistic(name, own[name].value, min(values), max(values), p, own[name].p))
     return sorted(rows, key=lambda row: row.p)
@@ -122,7 +122,7 @@ def _p(own: Statistic, controls: Sequence[Statistic], excess: float | None) -> f
     `excess` gives its variance.
     """
     count = len(controls)
-    mean = float(np.mean([each.value for each in controls]))
+    mean = float(np.mean([statistic.value for statistic in controls]))
     distance = abs(own.value - mean)
     if distance == 0:
         return 1.0
@@ -140,11 +140,11 @@ def _p(own: Statistic, controls: Sequence[Statistic], excess: float | None) -> f
 
 
 def _between(controls: Sequence[Statistic]) -> float:
-    return float(np.var([each.value for each in controls], ddof=1))
+    return float(np.var([statistic.value for statistic in controls], ddof=1))
 
 
 def _sampling(controls: Sequence[Statistic]) -> float:
-    return float(np.mean([(each.error or 0.0) ** 2 for each in controls]))
+    return float(np.mean([(statistic.error or 0.0) ** 2 for statistic in controls]))
 
 
 def changed_low_bits(file: Gaussians, other: Gaussians) -> float:

@@ -78,14 +78,16 @@ def bits(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
         columns = words.of_attribute(index)
         own = words.bits[:, columns][words.trained[:, columns]]
         if len(own):
-            statistics |= {f"{name}, {attribute}": each for name, each in _of_values(own).items()}
+            statistics |= {f"{name}, {attribute}": statistic for name, statistic in _of_values(own).items()}
             statistics[f"strata of {attribute}"] = _strata(own)
     harmonics = words.attribute >= _HARMONICS
     own, trained = words.bits[:, harmonics], words.trained[:, harmonics]
     exponent = words.exponent[:, harmonics]
     for magnitude, (low, high) in MAGNITUDES.items():
         values = own[trained & (exponent >= low) & (exponent < high)]
-        statistics |= {f"{name}, {magnitude} harmonics": each for name, each in _of_values(values).items()}
+        statistics |= {
+            f"{name}, {magnitude} harmonics": statistic for name, statistic in _of_values(values).items()
+        }
     small = trained & (exponent < MAGNITUDES["middling"][1])
     statistics["zeros together in a Gaussian"] = _count_variance(own, small)
     tiny = (trained & (exponent < MAGNITUDES["tiny"][1])).any(axis=1)
@@ -158,15 +160,15 @@ def agreement(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     for name, attributes in _GROUPS.items():
         pairs = list(_pairs_within_gaussians(words, attributes))
         if pairs:
-            one, other = (np.concatenate(each) for each in zip(*pairs, strict=True))
-            statistics |= {f"{key}, {name}": each for key, each in _of_pairs(one, other).items()}
+            one, other = (np.concatenate(side) for side in zip(*pairs, strict=True))
+            statistics |= {f"{key}, {name}": statistic for key, statistic in _of_pairs(one, other).items()}
     harmless = words.attribute > 0
     for name, rows in (
         ("neighbours", nearest_pairs(doubles(model.means), _NEIGHBOURS)),
         ("sharers", _sharers(words)),
     ):
         one, other = (words.bits[rows[:, side]][:, harmless].ravel() for side in (0, 1))
-        statistics |= {f"{key}, {name}": each for key, each in _of_pairs(one, other).items()}
+        statistics |= {f"{key}, {name}": statistic for key, statistic in _of_pairs(one, other).items()}
     return statistics
 
 
