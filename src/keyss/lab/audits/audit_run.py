@@ -63,10 +63,11 @@ def audit(
         raise UsageError(f"expected at least 2 plain models to compare with, got {controls}")
     for module in EXTRA:
         import_extra(module, "audit", "audit a run")
+    _, config, *_ = read_run(Path(run))
+    parts = _chosen(only, config.method)
     started, reporter = time.monotonic(), reporter or Reporter()
     with reporter.waiting("opening the secrets", len(keys) * seconds_for("reveal", stego_in(Path(run)))):
         opened = open_run(run, keys)
-    parts = _chosen(only, opened.config.method)
     subject = Subject(opened, resolve_device(device))
     settings = {"controls": controls, "only": only, "seed": seed, "device": subject.device.type}
     folder = RunFolder(

@@ -65,10 +65,13 @@ def images(subject: Subject, seed: int, progress: Progress) -> tuple[Section, Pi
             if shown is not None:
                 columns[column] = _renders(shown, scene)
                 pairs = zip(columns[column], scene.test, strict=True)
-                views = [view_quality(torch.from_numpy(image) / 255, view) for image, view in pairs]
-                mean = mean_quality(views)
+                views = {
+                    view.camera.name: view_quality(torch.from_numpy(image) / 255, view)
+                    for image, view in pairs
+                }
+                mean = mean_quality(list(views.values()))
                 psnrs.append(mean.psnr)
-                numbers[f"{name}, {column}"] = asdict(mean) | {"views": [asdict(view) for view in views]}
+                numbers[f"{name}, {column}"] = asdict(mean) | {"views": _builtins(views)}
                 texts = f"{mean.psnr:.2f}", f"{mean.ssim:.4f}", text_of(mean.lpips, ".4f"), f"{len(shown):,}"
                 rows.append((f"{name}, {column}", *texts))
         if index:
