@@ -34,9 +34,9 @@ def test_numbers_and_pictures_of_every_part(run_folder: Path) -> None:
         f"{numbers['stegexpose']['control']['auc']:.2f}",
         f"{changes[1]['secrets'][1]['psnr']:.2f}",
         f"{numbers['speed']['stego model']['ratio']:.2f}",
-        "mean over 3 seeds",
+        "Mean over 3 seeds.",
         "not tried: ",
-        "16 bits a number",
+        "Every number is rounded to half precision.",
     ]
     assert [text for text in shown if text not in report] == []
     files = PICTURE.findall(report)

@@ -103,9 +103,9 @@ def test_classifiers() -> None:
 
 
 def test_pruning() -> None:
-    whole = ChangeResult("none", 0, "", "")
+    whole = ChangeResult("none", 0, "")
     secret = ChangedQuality(20.0, 4.0)
-    pruned = ChangeResult("random pruning", 0.25, "share", "", 3, None, ChangedQuality(25.0, 2.5), (secret,))
+    pruned = ChangeResult("random pruning", 0.25, "", 3, None, ChangedQuality(25.0, 2.5), (secret,))
     (verdict,) = pruning_verdicts([whole, pruned])
     assert (verdict.value, verdict.beside, verdict.word) == ("secret -4.00 dB", "cover -2.50 dB", "fine")
     for worse in (replace(secret, loss=4.1), replace(secret, opens=False)):

@@ -241,7 +241,7 @@ def stegexpose_aucs(subject: Subject, models: Sequence[Gaussians]) -> list[Auc]:
 
 def leaks(subject: Subject, seed: int, progress: Progress) -> tuple[Section, Pictures]:
     """Attacks without the key on each secret, with the file or with its decoder."""
-    heads = ("PSNR, dB (leak)", "SSIM (leak)", "gradients (leak)", "variant")
+    heads = ("PSNR, dB (leak)", "SSIM (leak)", "gradients (leak)", "variant", "what it does")
     tables, results, pictures = [], {}, {}
     for index, (secret, opened) in enumerate(zip(subject.in_cover, subject.run.opened, strict=True), start=1):
         progress(index - 1, len(subject.in_cover))
@@ -265,6 +265,7 @@ def _leak_row(attack: AttackResult) -> tuple[str, ...]:
         f"{scores.ssim_fitted:.3f} ({leak.ssim_fitted:+z.3f})",
         f"{scores.gradient:.3f} ({leak.gradient:+z.3f})",
         attack.best,
+        attack.sentence,
     )
 
 
@@ -286,20 +287,20 @@ def robustness(subject: Subject, seed: int, progress: Progress) -> tuple[Section
     openers, scenes = subject.run.openers, subject.scenes
     results = measure_robustness(subject.stego, openers, scenes, seed=seed, progress=progress)
     names = [f"{role_of(index, len(scenes))}, dB" for index in range(len(scenes))]
-    table = Table(("change", "strength", *names), tuple(map(_change_row, results)))
+    table = Table(("change", *names), tuple(map(_change_row, results)))
     numbers = {"changes": _builtins(results)}
     return Section(verdicts=pruning_verdicts(results), tables=[table], numbers=numbers), {}
 
 
 def _change_row(result: ChangeResult) -> tuple[str, ...]:
     if result.cover is None:
-        return result.attack, f"not tried: {result.skipped}"
+        return result.sentence, f"not tried: {result.skipped}"
     cells = [
         f"{quality.psnr:.2f} ({-quality.loss:+z.2f})" if quality.opens else "does not open"
         for quality in (result.cover, *result.secrets)
     ]
-    repeated = f", mean over {result.seeds} seeds" if result.seeds > 1 else ""
-    return result.attack, f"{result.strength:g} {result.unit}{repeated}", *cells
+    repeated = f" Mean over {result.seeds} seeds." if result.seeds > 1 else ""
+    return f"{result.sentence}{repeated}", *cells
 
 
 def pruning_verdicts(results: Sequence[ChangeResult]) -> list[Verdict]:
