@@ -1,4 +1,4 @@
-"""Rough times of work on files of models, for the line that says how long it takes.
+"""Rough times of reading and writing models, for progress lines.
 
 Does not import torch.
 """
@@ -42,7 +42,7 @@ def seconds_to_convert(model: Path, out: Path, keys: int) -> float:
 
 def seconds_to_prepare(sources: Sequence[object]) -> float:
     """About the seconds to read models and to find what can be written in them; photos do not count."""
-    paths = [Path(each) for each in sources if isinstance(each, str | Path)]
+    paths = [Path(source) for source in sources if isinstance(source, str | Path)]
     count = sum(gaussians_in(path) for path in paths if path.is_file())
     return _START + _SECONDS["prepare"] * count / 1e6
 
