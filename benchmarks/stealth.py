@@ -38,7 +38,6 @@ from keyss.channels import LOW_BITS
 from keyss.core import Gaussians, UsageError
 from keyss.fitting import FitConfig
 from keyss.lab import stealth_statistics
-from keyss.methods import CarryOptions
 from keyss.methods.carry.capacity import CarryCapacity
 from keyss.rendering import Viewpoints
 from lab.stealth.candidates import candidate_scores
