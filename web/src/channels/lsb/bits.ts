@@ -111,12 +111,17 @@ const LAST = 255;
 
 /** Up to 4 salts of 16 bytes, the likeliest first; `low`: the low bits at the least depth, rows of `size` bytes. */
 export function salts(fields: Fields, ids: Uint8Array, low: Uint8Array, size: number): Uint8Array[] {
-  const late = new Uint8Array(fields.count);
-  for (let row = 0; row < fields.count; row++) late[row] = movedFromZero(fields, row) ? LAST : smallness(fields, row);
-  const order = Array.from(late.keys()).sort((a, b) => {
-    return late[a] - late[b] || compared(ids, a, b, ID_BYTES) || compared(low, a, b, size);
-  });
-  return order.slice(0, SALTS).map((row) =>
+  const late = new Map<number, number>();
+  const first: number[] = [];
+  for (let row = 0; row < fields.count; row++) {
+    const last = first[SALTS - 1];
+    if (late.get(last) === 0 && compared(ids, row, last, ID_BYTES) > 0) continue; // comes after it, late or not
+    late.set(row, movedFromZero(fields, row) ? LAST : smallness(fields, row));
+    first.push(row);
+    first.sort((a, b) => late.get(a)! - late.get(b)! || compared(ids, a, b, ID_BYTES) || compared(low, a, b, size));
+    first.length = Math.min(first.length, SALTS);
+  }
+  return first.map((row) =>
     saltOf(ids.subarray(row * ID_BYTES, (row + 1) * ID_BYTES), low.subarray(row * size, (row + 1) * size)),
   );
 }
