@@ -201,7 +201,8 @@ def _mark(
 ) -> None:
     """Set `apart` [N] for pairs of a row and one of its neighbours in `near` [N, K].
 
-    `least`: equal steps of harmonics. `first`: _COLOURS and _ZERO come before neighbours, _ZERO alone, or 0 for none of them.
+    `least`: equal steps of harmonics. `first`: what comes before neighbours, _COLOURS and _ZERO, _ZERO, or 0
+    for neither.
     """
     groups = geometry.shape[2] + 3 * (sh.shape[1] > 1)
     x = np.full((groups, _LANES), _NAN, np.uint32)  # unused lanes are equal to nothing

@@ -3,7 +3,7 @@
 In a trained model most low bits are uniformly random to anybody who does not know the training, but not all.
 A Gaussian is excluded as a whole, so that its numbers stay consistent, because of:
 
-- *Equal steps* away from zero or a neighbour: see `equal_steps`. These are also the harmonics of Gaussians
+- *Equal steps* away from zero, a sibling or another colour: see `equal_steps`. These are also the harmonics of Gaussians
   that no view shows, and numbers that training freezes in clones.
 - *Copies*: Gaussians that share their position, scales, quaternion or the harmonics of degree 1 of a colour
   with any other one, and values that occur too often.
@@ -94,7 +94,7 @@ class Carriers:
     def of(gaussians: Gaussians, layout: Layout) -> Carriers:
         """Raises UsageError, with what shows, if new low bits would show even at the least depth.
 
-        A sample of a large cover is tested first: the whole takes a second for each 200,000 Gaussians.
+        A sample of a large cover is tested first: the whole takes a second for each 50,000 Gaussians.
         """
         if len(gaussians) > _LARGE:
             sample = gaussians[:: len(gaussians) // _SAMPLE]
