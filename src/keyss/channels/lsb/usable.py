@@ -177,7 +177,9 @@ def salt_rows(gaussians: Gaussians, ids: Bytes, layout: Layout) -> Integers:
     keys = late << np.uint64(56) | numbers[rows] >> np.uint64(8)
     best = np.argpartition(keys, SALTS - 1)[:SALTS] if len(keys) > SALTS else np.arange(len(keys))
     low = read_low_bits(gaussians[torch.from_numpy(rows[best])], LEAST, layout)
-    places = [(late[each], ids[rows[each]].tobytes(), own.tobytes()) for each, own in zip(best, low, strict=True)]
+    places = [
+        (late[each], ids[rows[each]].tobytes(), own.tobytes()) for each, own in zip(best, low, strict=True)
+    ]
     return rows[best[sorted(range(len(best)), key=places.__getitem__)]]
 
 
