@@ -3,8 +3,8 @@
 In a trained model most low bits are uniformly random to anybody who does not know the training, but not all.
 A Gaussian is excluded as a whole, so that its numbers stay consistent, because of:
 
-- *Equal steps* away from zero, a sibling or another colour: see `equal_steps`. These are also the harmonics of Gaussians
-  that no view shows, and numbers that training freezes in clones.
+- *Equal steps* away from zero, a sibling or another colour: see `equal_steps`. These are also the harmonics
+  of Gaussians that no view shows, and numbers that training freezes in clones.
 - *Copies*: Gaussians that share their position, scales, quaternion or the harmonics of degree 1 of a colour
   with any other one, and values that occur too often.
 - *Nearly equal* scales, or colours of a harmonic: round and grey Gaussians.
@@ -14,7 +14,8 @@ A Gaussian is excluded as a whole, so that its numbers stay consistent, because 
 - *Short numbers*, five in a Gaussian, as of models in half precision.
 - *Small even numbers*, which an optimiser may have left on a coarser grid: see `trailing_zeros`.
 
-All but the last two are found in bits that embedding never changes. docs/threat-model.md tells what each hides.
+All but the last two are found in bits that embedding never changes. docs/threat-model.md tells what each
+hides.
 
 A *salt* of Argon2id is a hash of one Gaussian and its low bits, which are new random bits for every file and
 carry nothing else: no two files of one cover share a salt. There are several salts because Gaussians may be
