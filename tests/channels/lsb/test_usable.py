@@ -16,7 +16,7 @@ from keyss.channels.lsb import usable
 from keyss.channels.lsb.bits import DEPTHS, Layout, used_words, write_low_bits
 from keyss.channels.lsb.equal_steps import Steps
 from keyss.channels.lsb.trailing_zeros import count_trailing_zeros, least_exponent
-from keyss.channels.lsb.usable import MAX_SEPARATION
+from keyss.channels.lsb.usable import MAX_SEPARATION, chance_of_lattice
 from keyss.core import Gaussians, UsageError
 
 STEP = 2.0**-12  # scale of the last steps of the optimiser that rounds them
@@ -315,10 +315,24 @@ def test_covers_whose_harmonics_follow_each_other_are_refused() -> None:
     LOW_BITS.prepare(write_low_bits(model, Layout.of(model), [(8, np.flatnonzero(usable), noise)]))
 
 
+@pytest.mark.parametrize("factor", [1.3, 0.9, 4 / 3])
+def test_multiplied_colours_are_refused(factor: float) -> None:
+    """Of the floats of one exponent, not all are products."""
+    model = trained_like(3000)
+    with pytest.raises(UsageError, match=r"multiples of one step|not random"):
+        usable_carriers(replace(model, sh=model.sh * factor))
+    chances = [
+        chance_of_lattice(used_words(each), Layout.of(each))
+        for each in (trained_like(2000, seed) for seed in range(4))
+    ]
+    assert min(chances) > 1e-3
+
+
 def test_no_opacity_crosses_the_threshold_of_pruning() -> None:
     """Trainers remove opacities below 0.005. Those with the same fixed bits stay, and no others."""
     edge = np.float32(np.log(0.005 / 0.995))
-    words = edge.view(np.uint32) + np.arange(-1536, 1536, 3, np.int32).astype(np.uint32)
+    near = np.random.default_rng(1).integers(-1536, 1536, 1024, np.int32)
+    words = edge.view(np.uint32) + near.astype(np.uint32)
     model = trained_like(1024, 0)
     model = replace(model, opacity_logits=torch.from_numpy(words.view(np.float32).copy()))
     chosen = usable_carriers(model)

@@ -80,6 +80,8 @@ _FIRST = 1 << 12  # Gaussians of the smallest IDs, of which most models have eno
 _SHORT = 5  # numbers without low bits; by chance in one of ten million Gaussians
 _SETS_BY_CHANCE = 0.1  # maximum expected number of sets of equal values by chance
 _SAMPLE = 20_000  # Gaussians whose bits are tested
+_MANTISSAS, _WINDOW = 1 << 22, 1 << 16  # without the last bit; of one spectrum
+_SMOOTH = 1 << 10  # lowest frequencies, of the distribution of all numbers
 _LARGE = 10 * _SAMPLE  # Gaussians of a cover whose sample is tested first
 _CHANCE = 1e-6  # probability of refusing a depth of a model with uniform bits
 
@@ -139,6 +141,11 @@ def _what_tells(gaussians: Gaussians, layout: Layout, usable: Flags, depth: int,
                 f"the low bits of {name} in this cover are not random (p = {chance:.0e}), and new ones "
                 "would be seen: the cover was quantised, scaled or moved after its training"
             )
+    if depth == LEAST and (chance := chance_of_lattice(used, layout)) < _CHANCE:
+        return (
+            f"numbers of this cover are multiples of one step (p = {chance:.0e}), and new low bits would be "
+            "seen: its colours were multiplied after training, as an edit of their brightness does"
+        )
     if (chance := steps.chance(depth, usable)) < _CHANCE:
         return (
             f"numbers of this cover tell each other's low bits (p = {chance:.0e}), because they moved by "
@@ -166,6 +173,35 @@ def chance_of_bits(words: Words32, bits: int) -> float:
         chances.append(np.minimum(1, 2 * bdtr(smaller.astype(np.float64), times, 0.5)))
     every = np.concatenate(chances)
     return min(1.0, float(every.min() * len(every)))
+
+
+def chance_of_lattice(used: Words32, layout: Layout) -> float:
+    """p-value of mantissas on a lattice, for uniform ones; `used` [N, F].
+
+    A factor that is no power of two maps the floats of one exponent to a lattice, whose period shows in the
+    power spectrum of the counts of mantissas (Welch 1967). Bonferroni-corrected, over the most frequent
+    exponent of each attribute and colour.
+    """
+    from scipy.fft import rfft  # both take long to load
+    from scipy.special import gammaincc
+
+    columns = [np.arange(GEOMETRY)[group] for name, group in _GROUPS.items() if name != "harmonics"]
+    columns += [np.arange(GEOMETRY + colour, used.shape[1], 3) for colour in range(3)]
+    chances = [1.0]
+    for group in columns:
+        words = used[:, np.intersect1d(group, layout.columns)].ravel()
+        if not len(words):
+            continue
+        exponents = _exponents(words)
+        words = words[exponents == np.bincount(exponents).argmax()]
+        mantissas = (words >> np.uint32(1)) & np.uint32(_MANTISSAS - 1)  # the last bit is never written
+        counts = np.bincount(mantissas, minlength=_MANTISSAS).astype(np.float32).reshape(-1, _WINDOW)
+        powers = (np.abs(rfft(counts)[:, _SMOOTH:-1]) ** 2).sum(axis=0)
+        # Of uniform mantissas, the power has the mean and at most the variance of a gamma distribution.
+        total, squares = len(words), float((counts.sum(axis=1, dtype=np.float64) ** 2).sum())
+        shape = total**2 / squares
+        chances.append(gammaincc(shape, shape * float(powers.max()) / total) * len(powers))
+    return float(min(1.0, min(chances) * len(columns)))
 
 
 def salt_rows(gaussians: Gaussians, ids: Bytes, layout: Layout) -> Integers:
