@@ -219,8 +219,8 @@ def embed_models(
         for model, limit, views in zip(models, limits, viewpoints, strict=True)
     ]
     stego = cover.embed(list(zip(keys, payloads, strict=True)), entropy=entropy)
-    opened = [CarriedSecret.of(open_payload(stego, key)) for key in keys]
-    if [len(each.gaussians) for each in opened] != list(map(len, models)):
+    opened = [CarriedSecret(open_payload(stego, key)) for key in keys]
+    if [each.payload.data for each in opened] != [each.data for each in payloads]:
         raise RuntimeError("the embedded secrets do not open again as they should")
     sizes = [len(each.data) for each in payloads]
     details: dict[str, Any] = {
