@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from keyss.channels.lsb.bits import LEAST, Layout, bit_patterns
-from keyss.core.arrays import Doubles, Flags, Integers, Words32, doubles
+from keyss.core.arrays import Flags, Integers, Words32, doubles
 from keyss.core.gaussians import Gaussians
 from keyss.core.neighbours import Neighbours
 from keyss.files.formats.common import morton_order
@@ -114,8 +114,8 @@ def _words(gaussians: Gaussians, layout: Layout) -> tuple[Words32, Words32]:
     geometry = torch.cat([gaussians.log_scales, gaussians.opacity_logits[:, None]], dim=1)[:, :, None]
     if layout.quats:
         geometry = torch.cat([geometry, gaussians.quats[:, :, None]], dim=2)
-    shapes = geometry.shape, gaussians.sh.shape
-    return tuple(bit_patterns(x).reshape(shape) for x, shape in zip((geometry, gaussians.sh), shapes))
+    sh = gaussians.sh
+    return bit_patterns(geometry).reshape(*geometry.shape), bit_patterns(sh).reshape(*sh.shape)
 
 
 def _hits(words: Words32, depth: int) -> Integers:
@@ -195,10 +195,10 @@ def _mark(rows: Any, near: Any, geometry: Any, sh: Any, depth: int, apart: Any) 
 
 @kernel
 def _pairs(rows: Any, near: Any, geometry: Any, sh: Any, depth: int, found: Any) -> int:
-    """List pairs of numbers that differ by equal steps between `rows` and neighbours; returns how many.
+    """List pairs of numbers that differ by equal steps between `rows` and their neighbours; how many.
 
-    `found` [M, 7]: first number of row and neighbour, second number, row and neighbour, 1 for harmonics. Lists
-    at most M. Steps of up to two cells are small by chance.
+    `found` [M, 7]: one number of row and neighbour, the other one, row and neighbour, 1 for harmonics. Lists at
+    most M. Steps of up to two cells do not count: many are that small by chance.
     """
     groups, count = geometry.shape[2] + 3 * (sh.shape[1] > 1), 0
     x, y = np.full((groups, _LANES), _NAN, np.uint32), np.zeros((groups, _LANES), np.uint32)

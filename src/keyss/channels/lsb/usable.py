@@ -172,13 +172,17 @@ def salt_rows(gaussians: Gaussians, ids: Bytes, layout: Layout) -> Integers:
     keys = late << np.uint64(56) | numbers[rows] >> np.uint64(8)
     best = np.argpartition(keys, SALTS - 1)[:SALTS] if len(keys) > SALTS else np.arange(len(keys))
     low = read_low_bits(gaussians[torch.from_numpy(rows[best])], LEAST, layout)
-    places = [(late[each], ids[rows[each]].tobytes(), own.tobytes()) for each, own in zip(best, low, strict=True)]
+    places = [
+        (late[each], ids[rows[each]].tobytes(), own.tobytes()) for each, own in zip(best, low, strict=True)
+    ]
     return rows[best[sorted(range(len(best)), key=places.__getitem__)]]
 
 
 def _lateness(gaussians: Gaussians, layout: Layout) -> Words:
-    """[N] 255 for Gaussians that moved by equal steps away from zero; else the octaves by which the smallest
-    even number lies below _LARGE_ENOUGH, 0 for larger ones."""
+    """[N] octaves by which the smallest even number lies below _LARGE_ENOUGH, 0 for larger ones.
+
+    255 for Gaussians that moved by equal steps away from zero.
+    """
 
     def work(start: int, stop: int) -> Words:
         used = used_words(gaussians[start:stop])[:, layout.columns]
