@@ -68,7 +68,12 @@ def server_of(count: int, folder: Path) -> ModelServer:
     """Serve the page and a stego model."""
     cover, secret = sized_model(count, 0), sized_model(count * 9 // 10, 1).with_sh_degree(0)
     hidden = keyss.hide(
-        cover, [keyss.Secret(secret, KEY)], method=CarryOptions(), width=32, min_psnr=0, out=folder / "run"
+        cover,
+        [keyss.Secret(secret, KEY)],
+        method=CarryOptions(),
+        views=keyss.ViewOptions(32),
+        min_psnr=0,
+        out=folder / "run",
     )
     print(f"{len(hidden.stego):,} Gaussians carry {len(secret):,}", flush=True)
     server = ModelServer(folder / "run/publish/model.ply")
@@ -101,7 +106,12 @@ def key_times(pairs: list[str], runs: int) -> None:
             cover, secret = pair.split(":")
             method = CarryOptions(fine_tune="never")
             keyss.hide(
-                cover, [keyss.Secret(secret, KEY)], method=method, width=32, min_psnr=0, out=folder / "run"
+                cover,
+                [keyss.Secret(secret, KEY)],
+                method=method,
+                views=keyss.ViewOptions(32),
+                min_psnr=0,
+                out=folder / "run",
             )
             page = export_html(folder / "run/publish/model.ply", folder / "page.html")[0]
             times: dict[str, list[float]] = {KEY: [], "another key": []}

@@ -35,10 +35,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from channels.lsb.payloads import embed_derived
 from channels.lsb.trained_like import keys, rounded
+from keyss.channels import LOW_BITS
 from keyss.core import Gaussians, UsageError
+from keyss.fitting import FitConfig
 from keyss.lab import stealth_statistics
 from keyss.methods.carry.capacity import CarryCapacity
-from keyss.methods.carry.carry_options import CarryOptions
 from keyss.rendering import Viewpoints
 from lab.stealth.candidates import candidate_scores
 from methods.carry import carried
@@ -134,7 +135,7 @@ def _make(job: Job) -> list[File]:
     if job.rounded:
         cover = rounded(cover, job.index)
     made = [File("plain", job.scene, job.path, cover)]
-    capacity = CarryCapacity.of(cover, CarryOptions(format="ply").with_fit(sh_degree=cover.sh_degree))
+    capacity = CarryCapacity.of(LOW_BITS, cover, FitConfig())
     whole = read_model(job.secret)
     (secret,) = capacity.prune([whole], [Viewpoints.around(whole)])
     stego = carried.embed_derived(cover, [(keys(2 * job.index), secret)], os.urandom(32))

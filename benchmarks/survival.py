@@ -13,9 +13,8 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
-from keyss import SecretFile, hide_files, reveal
+from keyss import CarryOptions, SecretFile, hide, reveal
 from colours import FORMATS, OTHERS, OWN, Change, cheap_keys, sampled
 from keyss.core import BackendError, Gaussians, InputError, WrongKeyError
 from keyss.files import load_scene, read_model
@@ -25,11 +24,11 @@ from keyss.methods import HiddenFile
 import numpy as np
 
 KEY = "a key of the benchmark 4711"
-CHANNELS: dict[str, dict[str, Any]] = {
-    "low bits (`ply`)": {"publish": "unchanged"},
-    "codes (`spz`)": {"format": "spz"},
-    "colours (`converted`)": {"publish": "converted", "channel": "colours"},
-    "appended (`converted`)": {"publish": "converted", "channel": "appended"},
+CHANNELS = {
+    "low bits (`ply`)": CarryOptions(publish="unchanged"),
+    "codes (`spz`)": CarryOptions(format="spz"),
+    "colours (`converted`)": CarryOptions(publish="converted", channel="colours"),
+    "appended (`converted`)": CarryOptions(publish="converted"),
 }
 
 
@@ -57,7 +56,7 @@ def main() -> None:
     model = sampled(read_model(asked.model), asked.gaussians)
     data = np.random.default_rng(0).bytes(asked.bytes)
     secret = SecretFile(data, KEY, "file")
-    made = {name: hide_files(model, [secret], **options) for name, options in CHANNELS.items()}
+    made = {name: hide(model, [secret], method=options) for name, options in CHANNELS.items()}
     print(f"{asked.model.stem}, {len(model):,} Gaussians, a file of {asked.bytes} bytes\n")
     print(f"| what becomes of the model | {' | '.join(made)} |")
     print("| --- |" + " --- |" * len(made))

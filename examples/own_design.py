@@ -18,5 +18,7 @@ if __name__ == "__main__":
     cover, secret, out = sys.argv[1:]
     key = generate_key()
     options = KeyssOptions(design=DESIGN).with_fit(iterations=200, max_gaussians=2000)
-    keyss.hide(cover, [Secret(secret, key)], method=options, width=100, out=out, min_psnr=0)
+    keyss.hide(
+        cover, [Secret(secret, key)], method=options, views=keyss.ViewOptions(100), out=out, min_psnr=0
+    )
     print(keyss.reveal(f"{out}/publish/model.ply", key).gaussians)

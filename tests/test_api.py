@@ -19,7 +19,7 @@ from numpy.lib.recfunctions import unstructured_to_structured
 from plyfile import PlyData, PlyElement
 
 import keyss
-from keyss import CarryOptions, FitConfig, Secret
+from keyss import CarryOptions, FitConfig, Secret, SecretFile
 from keyss.cli import main
 from keyss.core import InputError, OutputError, Scene, UsageError, WrongKeyError
 from tiny_scenes import HEIGHT, WIDTH, random_gaussians, tiny_scene
@@ -66,7 +66,7 @@ def write_nerfstudio(
 
 def psnr_of_pictures(model: Path, scene: Path, width: int | None = None) -> float:
     """Mean over the test views of a scene, independent of keyss's measures."""
-    pictures = [picture for _, picture in keyss.render(model, scene, width=width)]
+    pictures = [picture for _, picture in keyss.render(model, scene, views=keyss.ViewOptions(width))]
     errors = [
         (picture.float() - view.image.float()).square().mean() / 255**2
         for picture, view in zip(pictures, keyss.load_scene(scene, width=width).test, strict=True)
@@ -182,7 +182,13 @@ def test_command_line_matches_api(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         keyss.write_model(tmp_path / f"{index}.ply", random_gaussians(count, seed=index))
     cover, secret = (tmp_path / f"{index}.ply" for index in (0, 1))
     python = CarryOptions(publish="converted", fine_tune="always").with_fit(iterations=2, seed=0)
-    keyss.hide(cover, [Secret(secret, "the key")], method=python, width=24, out=tmp_path / "python")
+    keyss.hide(
+        cover,
+        [Secret(secret, "the key")],
+        method=python,
+        views=keyss.ViewOptions(24),
+        out=tmp_path / "python",
+    )
     arguments = ["--cover", str(cover), "--secret", str(secret), "--width", "24", "--iterations", "2"]
     arguments += ["--seed", "0"]
     assert (
@@ -203,7 +209,9 @@ def test_command_line_matches_api(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     for name in ("private/config.json", "publish/model.ply"):
         assert (tmp_path / "line" / name).read_bytes() == (tmp_path / "python" / name).read_bytes(), name
     config = json.loads((tmp_path / "line" / "private" / "config.json").read_text())["options"]
-    assert (config["fine_tuning_steps"], config["fit"]["iterations"]) == ([2], 2)
+    assert (config["iterations"], config["fit"]["iterations"]) == (2, 2)
+    metrics = json.loads((tmp_path / "line" / "private" / "metrics.json").read_text())
+    assert metrics["iterations"] == 2
 
 
 def _signatures() -> str:
@@ -243,6 +251,7 @@ def test_public_api() -> None:
         ("g.ply", r"expected a list, such as \[Secret"),
         (Secret("g.ply", "key"), r"expected a list, such as \[Secret"),
         ([], "expected 1 to"),
+        ([Secret("g.ply", "key"), SecretFile(b"", "other key")], "scenes or files, got both"),
     ],
 )
 def test_secrets_say_what_is_expected(secrets: Any, words: str) -> None:
@@ -250,17 +259,21 @@ def test_secrets_say_what_is_expected(secrets: Any, words: str) -> None:
         keyss.hide(random_gaussians(), secrets)
 
 
-def test_preset() -> None:
-    """As on the command line; options have their own schedule."""
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"min_psnr": 0}, "`min_psnr` is for hidden scenes"), ({"method": "keyss"}, "keyss hides scenes only")],
+)
+def test_options_of_scenes_are_refused_for_files(options: Any, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        keyss.hide(random_gaussians(), [SecretFile(b"", "a key of a file")], **options)
+
+
+def test_method_by_name_has_the_default_preset() -> None:
     chosen = [keyss.Secret(tiny_scene(1), "a key of a secret scene")]
-    for name in ("quick", "default"):
-        found = keyss.hide(tiny_scene(), chosen, preset=name, publish="converted", dry_run=True).cost
-        options = CarryOptions.preset(name)
-        assert found is not None
-        expected = keyss.hide(tiny_scene(), chosen, method=options, publish="converted", dry_run=True).cost
-        assert expected is not None
-        assert found.steps == expected.steps
+    costs = [
+        keyss.hide(tiny_scene(), chosen, method=method, publish="converted", dry_run=True).cost
+        for method in ("carry", CarryOptions.preset("default"), CarryOptions.preset("quick"))
+    ]
+    assert [cost.steps for cost in costs] == [costs[0].steps] * 2 + [costs[0].steps // 2]
     with pytest.raises(UsageError, match="expected quick or default or full"):
-        keyss.hide(tiny_scene(), chosen, preset="slow", dry_run=True)
-    with pytest.raises(UsageError, match="options have their own schedule"):
-        keyss.hide(tiny_scene(), chosen, method=keyss.CarryOptions(), preset="quick", dry_run=True)
+        CarryOptions.preset("slow")

@@ -10,7 +10,7 @@ import pytest
 from files.scene_files import write_blender, write_nerfstudio
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
-SHORT = 'method=keyss.CarryOptions(publish="converted").with_fit(iterations=10, max_gaussians=100), width=200'
+SHORT = 'method=keyss.CarryOptions(publish="converted").with_fit(iterations=10, max_gaussians=100), '
 
 
 def test_python_example(
@@ -18,7 +18,7 @@ def test_python_example(
 ) -> None:
     (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert len(example.splitlines()) <= 10
-    short = "import keyss\n" + example.replace("width=200", SHORT, 1)
+    short = "import keyss\n" + example.replace("views=views, out", SHORT + "views=views, out")
     assert SHORT in short
     write_blender(tmp_path / "scenes" / "bonsai", count=2)
     write_nerfstudio(tmp_path / "scenes" / "fox")

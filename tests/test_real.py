@@ -67,7 +67,9 @@ def test_quality_between_public_models(
     models: dict[str, Gaussians], cover: str, secret: str, minimum: tuple[float, float]
 ) -> None:
     """PSNR in dB against renders of the models themselves."""
-    metrics = keyss.hide(models[cover], [Secret(models[secret], "a key for a model")], width=200).metrics
+    metrics = keyss.hide(
+        models[cover], [Secret(models[secret], "a key for a model")], views=keyss.ViewOptions(200)
+    ).metrics
     psnrs = [each.psnr for each in metrics.against_plain]
     assert psnrs[0] > minimum[0], psnrs
     assert psnrs[1] > minimum[1], psnrs

@@ -21,7 +21,9 @@ def run(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Fox hidden in bonsai at width 200 with 20,000 Gaussians."""
     out = tmp_path_factory.mktemp("runs") / "hidden"
     secret = Secret(real_data / "fox", "a key for a fox")
-    keyss.hide(real_data / "bonsai", [secret], method=CONFIG, width=200, bound=True, out=out)
+    keyss.hide(
+        real_data / "bonsai", [secret], method=CONFIG, views=keyss.ViewOptions(200), bound=True, out=out
+    )
     return out
 
 
@@ -51,7 +53,7 @@ def test_audit_of_stealth(run: Path, real_data: Path, tmp_path: Path) -> None:
         real_data / "bonsai",
         [secret],
         method=CarryOptions(fit=CONFIG.fit),
-        width=200,
+        views=keyss.ViewOptions(200),
         cover_model=plain[0],
         out=out,
     )
@@ -66,7 +68,9 @@ def test_other_pairs(real_data: Path, cover: str, secret: str) -> None:
     """White and empty backgrounds, no points, partial and full rings of cameras."""
     config = CONFIG.with_fit(iterations=1000, max_gaussians=10_000)
     secrets = [Secret(real_data / secret, "key")]
-    metrics = keyss.hide(real_data / cover, secrets, method=config, width=160, bound=True).metrics
+    metrics = keyss.hide(
+        real_data / cover, secrets, method=config, views=keyss.ViewOptions(160), bound=True
+    ).metrics
     assert metrics.cover.psnr > metrics.baseline.cover.psnr - 0.01
     assert metrics.secrets[0].psnr > metrics.baseline.secrets[0].psnr - 1
 

@@ -64,7 +64,7 @@ def test_hide_at_any_scale(publish: str, scale: float) -> None:
     noise = torch.Generator().manual_seed(0)
     cover = cover.map(lambda v: (v * (1 + 1e-6 * torch.randn(v.shape, generator=noise))).float())
     secret = random_gaussians(100, seed=2)
-    hidden = keyss.hide(cover, [Secret(secret, KEY)], publish=publish, width=64)  # type: ignore[arg-type]
+    hidden = keyss.hide(cover, [Secret(secret, KEY)], publish=publish, views=keyss.ViewOptions(64))  # type: ignore[arg-type]
     assert hidden.metrics.against_plain[0].psnr > 60
     assert hidden.metrics.cover.ssim > 0.99
     assert len(keyss.reveal(hidden.stego, KEY).gaussians) == 100
@@ -75,4 +75,6 @@ def test_distant_model_is_refused() -> None:
         random_gaussians(500)
     )
     with pytest.raises(UsageError, match=r"splat-transform .* -t 45678"):
-        keyss.hide(cover, [Secret(random_gaussians(20), KEY)], publish="converted", width=24)
+        keyss.hide(
+            cover, [Secret(random_gaussians(20), KEY)], publish="converted", views=keyss.ViewOptions(24)
+        )

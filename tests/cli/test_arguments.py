@@ -75,9 +75,7 @@ def test_options_override_preset(keyss: Run, hide_calls: list[Any]) -> None:
     assert config.fit.evaluate_every == PRESETS["quick"].evaluate_every
     assert options.pop("reporter") is not None
     assert options == {
-        "width": 10,
-        "background": (1.0, 0.5, 0.0),
-        "skip_missing": False,
+        "views": library.ViewOptions(10, (1.0, 0.5, 0.0)),
         "cover_model": Path("m.ply"),
         "bound": False,
         "min_psnr": None,

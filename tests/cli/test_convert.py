@@ -122,9 +122,7 @@ def test_secret_survives_ply_to_ply(keyss: Run, files: Path, tmp_path: Path) -> 
 
 
 def test_losing_a_hidden_file_needs_force(keyss: Run, files: Path, tmp_path: Path) -> None:
-    stego = package.hide_files(
-        trained_like(2500), [package.SecretFile(b"a letter" * 20, "q7Rv2LxT9bWm4KzD")]
-    ).stego
+    stego = package.hide(trained_like(2500), [package.SecretFile(b"a letter" * 20, "q7Rv2LxT9bWm4KzD")]).stego
     write_model(tmp_path / "stego.ply", stego)
     key = ("--key-file", files / "other")
     refused = keyss("convert", tmp_path / "stego.ply", tmp_path / "out.sog", *key)
@@ -169,7 +167,7 @@ def test_training_folder_as_model(keyss: Run, tmp_path: Path) -> None:
     assert len(read_model(tmp_path / "a.spz")) == COUNT + 3000
 
 
-def test_low_bits_beside_appended_gaussians_must_not_be_converted(
+def test_converting_low_bits_beside_appended_gaussians_is_refused(
     keyss: Run, files: Path, tmp_path: Path
 ) -> None:
     write_model(tmp_path / "cover.ply", trained_like(1500))

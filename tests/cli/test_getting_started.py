@@ -27,7 +27,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_key_sources_are_equivalent(keyss: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     text = Path("key.txt").read_text()
     assert text.endswith("\n")
-    library.hide("cover.ply", [library.Secret("small.ply", text)], width=16, out="run")
+    library.hide("cover.ply", [library.Secret("small.ply", text)], views=library.ViewOptions(16), out="run")
     assert keyss("reveal", "run/publish/model.ply", "--key-file", "key.txt", "-o", "out.ply").status == 0
     assert library.reveal("run/publish/model.ply", library.read_key("key.txt")).gaussians.sh_degree == 2
     for key, status in ((f"{KEY} ", 0), (f"{KEY}x", 3)):
@@ -41,7 +41,7 @@ def test_cover_without_harmonics(keyss: Run) -> None:
     flat = [word.replace("cover.ply", "flat.ply") for word in HIDE]
     shown = keyss(*flat, "--secret", "small.ply", "-o", "shown")
     assert shown.status == 0, shown.err
-    assert "whoever inspects the published file sees that it holds something" in shown.err.splitlines()[0]
+    assert "falling back to --publish converted, which inspection finds" in shown.err.splitlines()[0]
     refused = keyss(*flat, "--secret", "small.ply", "--format", "ply", "-o", "run")
     assert refused.status == 7  # few low bits, for a few Gaussians of the secret
     assert "--publish converted keeps all of them" in refused.err

@@ -16,7 +16,7 @@ from cli.harness import Run, assert_refused, listing, write_key
 from keyss import read_model, write_model
 from keyss.channels import Payload
 from keyss.cli import main
-from keyss.core import InputError, UsageError
+from keyss.core import InputError, KeyssWarning, UsageError
 from keyss.methods import HiddenFile
 
 KEYS = ("q7Rv2LxT9bWm4KzD", "W2mz8Qe5TnYc6LkA")
@@ -31,7 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (made / "empty").write_bytes(b"")
     for index, key in enumerate(KEYS):
         write_key(made / f"key{index}", key)
-    assert main([str(each) for each in _arguments(made, made / "out")]) == 0
+    assert main([str(argument) for argument in _arguments(made, made / "out")]) == 0
     return made
 
 
@@ -51,6 +51,15 @@ def test_round_trip(keyss: Run, folder: Path, tmp_path: Path) -> None:
         assert repr(name) in result.out
         assert out.read_bytes() == (folder / name).read_bytes()
         assert stat.S_IMODE(out.stat().st_mode) == 0o600
+
+
+def test_hidden_model_file_is_revealed_as_it_was(tmp_path: Path) -> None:
+    """Its suffix is that of a model, and its bytes are not read as one."""
+    hidden = library.hide(trained_like(2000), [library.SecretFile(b"any bytes", KEYS[0], "scan.ply")])
+    library.reveal(hidden.stego, KEYS[0], out=tmp_path / "back.ply")
+    assert (tmp_path / "back.ply").read_bytes() == b"any bytes"
+    with pytest.raises(UsageError, match=r"name the output like it, not back\.spz"):
+        library.reveal(hidden.stego, KEYS[0], out=tmp_path / "back.spz")
 
 
 def test_verify(keyss: Run, folder: Path) -> None:
@@ -88,7 +97,7 @@ def test_invalid_combinations(keyss: Run, folder: Path, workspace: Path, tmp_pat
     photos = ("hide", "--cover", workspace / "a", "--secret-file", folder / "empty", "-o", out)
     assert_refused(keyss(*photos, "--key-file", folder / "key0"), 2, "needs a model as the cover")
     stego, key = folder / "out" / "publish" / "model.ply", ("--key-file", folder / "key0")
-    assert_refused(keyss("reveal", stego, *key, "-o", tmp_path / "s.ply"), 4, "a file of 3,000 bytes")
+    assert_refused(keyss("reveal", stego, *key, "-o", tmp_path / "s.ply"), 2, "3,000 bytes, 'letter.pdf'")
     assert_refused(keyss("reveal", stego, *key, "-o", back, "--force"), 2, "--force")
     assert_refused(keyss("reveal", folder / "cover.ply", *key, "-o", back), 3, "opens nothing")
     assert_refused(keyss("reveal", stego, *key, "-o", stego.parent / "back"), 5, "given away")
@@ -98,16 +107,22 @@ def test_invalid_combinations(keyss: Run, folder: Path, workspace: Path, tmp_pat
 def test_names_that_are_not_text(folder: Path, tmp_path: Path) -> None:
     named = tmp_path / os.fsdecode(b"K\xfcche.pdf")
     named.write_bytes(b"plan")
-    hidden = library.hide_files(folder / "cover.ply", [library.SecretFile(named, KEYS[0])])
+    hidden = library.hide(folder / "cover.ply", [library.SecretFile(named, KEYS[0])])
     assert hidden.stego is not None
     assert library.reveal(hidden.stego, KEYS[0]).file == HiddenFile(
         "K\N{REPLACEMENT CHARACTER}che.pdf", b"plan"
     )
 
 
-def test_file_too_large(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"too small to carry .* Gaussians would do; .*channel="):
-        library.hide_files(trained_like(2000), [library.SecretFile(os.urandom(90_000), KEYS[0])])
+def test_file_too_large() -> None:
+    """It is appended, unless the model must stay unchanged."""
+    large, cover = library.SecretFile(os.urandom(90_000), KEYS[0]), trained_like(2000)
+    with pytest.raises(UsageError, match=r"too small to carry .* Gaussians would do; .publish=.converted."):
+        library.hide(cover, [large], publish="unchanged")
+    with pytest.warns(KeyssWarning, match="undetectably.*too small to carry"):
+        hidden = library.hide(cover, [large])
+    assert hidden.survives
+    assert library.reveal(hidden.stego, KEYS[0]).file.data == large.file
 
 
 def test_hidden_file_survives_conversion(keyss: Run, folder: Path, tmp_path: Path) -> None:
@@ -129,7 +144,7 @@ def test_hidden_file_survives_conversion(keyss: Run, folder: Path, tmp_path: Pat
 @given(st.binary(max_size=300))
 def test_foreign_payloads(data: bytes) -> None:
     try:
-        found = HiddenFile.of(Payload("file", data))
+        file = HiddenFile.of(Payload("file", data))
     except InputError:
         return
-    assert len(found.data) <= len(data)
+    assert len(file.data) <= len(data)

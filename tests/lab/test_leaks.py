@@ -118,7 +118,7 @@ def test_carried_secret_does_not_leak() -> None:
         close = (cover.opacities - threshold).abs() < 0.01 * threshold
         cover = replace(cover, opacity_logits=cover.opacity_logits + 0.1 * close)
     secret = keyss.Secret(random_gaussians(200, seed=1), "a key")
-    carried = keyss.hide(cover, [secret], method="carry", width=40).stego
+    carried = keyss.hide(cover, [secret], method="carry", views=keyss.ViewOptions(40)).stego
     rows, pictures = look_for_secret(carried, [cover], _secret_in_cover(), _attacks())
     for row in rows:
         if not row.attack.endswith("opacities"):

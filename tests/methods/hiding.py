@@ -42,12 +42,13 @@ def hide_scenes(
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*appended", KeyssWarning)
         sources = [
-            Source(model, True, *each) for model, *each in zip(given, ("", *keys), scenes, strict=True)
+            Source(model, True, key, scene)
+            for model, key, scene in zip(given, ("", *keys), scenes, strict=True)
         ]
-        options = method.prepare(sources, options)
+        prepared = method.prepare(sources, options)
         context = Context(torch.device("cpu"), checkpoints, resume, reporter, entropy=bytes(32))
-        cover, *secrets = fit_plain_models(sources, options.fits(len(sources)), context)
-        stego = method.hide(cover, secrets, options, context)
+        sources = fit_plain_models(sources, prepared.fits, context)
+        stego = method.hide(sources, method.prepare(sources, options, prepared), context)
     return Hidden(stego.gaussians, stego.opened)
 
 

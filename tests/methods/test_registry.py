@@ -25,6 +25,8 @@ from keyss.methods import (
     Frame,
     HiddenScene,
     MethodOptions,
+    Plan,
+    Prepared,
     Source,
     Stego,
     registry,
@@ -61,18 +63,19 @@ class WholeMethod:
     capabilities = Capabilities()
     options = WholeOptions
 
-    def prepare(self, sources: Sequence[Source], options: WholeOptions) -> WholeOptions:
+    def prepare(
+        self, sources: Sequence[Source], options: WholeOptions, earlier: Prepared | None = None
+    ) -> Prepared:
         model = sources[1].given
         if model is not None and len(model) > options.most:
             raise UsageError(f"expected at most {options.most} Gaussians, got {len(model)}")
-        return options
+        plan = Plan(gaussians=2500, sh_degree=3, secret_gaussians=options.most, capacity=options.most)
+        return Prepared.of(options, len(sources), plan)
 
-    def hide(
-        self, cover: Source, secrets: Sequence[Source], options: WholeOptions, context: Context
-    ) -> Stego:
-        (secret,) = secrets
+    def hide(self, sources: Sequence[Source], prepared: Prepared, context: Context) -> Stego:
+        cover, secret = sources
         model = secret.model
-        columns = [getattr(model, each.name) for each in fields(Gaussians)]
+        columns = [getattr(model, field.name) for field in fields(Gaussians)]
         rows = torch.cat([column.reshape(len(model), -1) for column in columns], dim=1)
         payload = Payload("whole", rows.numpy().tobytes())
         stego = LOW_BITS.prepare(cover.model).embed([(secret.key, payload)])
@@ -110,7 +113,9 @@ def models(tmp_path: Path) -> tuple[Path, Path]:
 
 def test_api(models: tuple[Path, Path], tmp_path: Path) -> None:
     cover, secret = models
-    result = keyss.hide(cover, [Secret(secret, KEY)], method="whole", width=24, out=tmp_path / "run")
+    result = keyss.hide(
+        cover, [Secret(secret, KEY)], method="whole", views=keyss.ViewOptions(24), out=tmp_path / "run"
+    )
     assert result.metrics.method == "whole"
     (secret_quality,), (plain,) = result.metrics.secrets, result.metrics.baseline.secrets
     assert plain is not None
@@ -152,7 +157,9 @@ def test_command_line(
 
 def test_unknown_method(models: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cover, secret = models
-    stego = keyss.hide(cover, [Secret(secret, KEY)], method="whole", width=24, out=tmp_path / "run").stego
+    stego = keyss.hide(
+        cover, [Secret(secret, KEY)], method="whole", views=keyss.ViewOptions(24), out=tmp_path / "run"
+    ).stego
     monkeypatch.delitem(registry.METHODS, "whole")
     with pytest.raises(InputError, match="'whole'"):
         keyss.reveal(stego, KEY)

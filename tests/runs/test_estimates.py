@@ -12,7 +12,7 @@ from keyss.files import write_model
 from keyss.runs.estimates import gaussians_in, seconds_for, seconds_to_convert, seconds_to_prepare
 
 
-def test_sizes_of_models_are_those_of_headers_or_about_right(tmp_path: Path) -> None:
+def test_estimated_model_sizes(tmp_path: Path) -> None:
     (tmp_path / "point_cloud/iteration_7").mkdir(parents=True)
     inside = tmp_path / "point_cloud/iteration_7/point_cloud.ply"
     write_model(inside, model_of(3000, 2))

@@ -63,9 +63,11 @@ def test_bound_takes_longer() -> None:
 def test_capacity(tmp_path: Path) -> None:
     cover, secret = trained_like(2500), trained_like(6000, 2)
     options = CarryOptions(fine_tune="never")
-    found = keyss.hide(cover, [Secret(secret, KEY)], method=options, width=24, dry_run=True)
+    found = keyss.hide(
+        cover, [Secret(secret, KEY)], method=options, views=keyss.ViewOptions(24), dry_run=True
+    )
     plan = found.plan
-    result = keyss.hide(cover, [Secret(secret, KEY)], method=options, width=24, min_psnr=0)
+    result = keyss.hide(cover, [Secret(secret, KEY)], method=options, views=keyss.ViewOptions(24), min_psnr=0)
     assert plan.secret_gaussians == 6000
     # Fewer harmonics make room for more Gaussians than planned.
     assert 1000 < plan.capacity <= result.metrics.secret_gaussians[0] < 6000

@@ -41,7 +41,7 @@ def _hide(folder: Path, options: MethodOptions, **how: object) -> Path:
         cover,
         [Secret(secret, KEY)],
         method=options,
-        width=24,
+        views=keyss.ViewOptions(24),
         min_psnr=0,
         out=out,
         **how,  # type: ignore[arg-type]

@@ -28,7 +28,7 @@ def test_loss_warnings(recovered: Recovered, expected: list[str]) -> None:
     assert check_secret(Revealed(None, recovered, tuple(warnings))).problems == tuple(warnings)
 
 
-def test_duplicates_are_counted_as_by_comparing_all_rows() -> None:
+def test_duplicates_match_pairwise_comparison() -> None:
     model = random_gaussians(3000, seed=4)
     rows = torch.randint(0, 3000, (900,), generator=torch.Generator().manual_seed(5))
     repeated = Gaussians.cat([model, model[rows], model[rows[:40]]])

@@ -20,7 +20,7 @@ from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_visible, psnr_between
 from keyss.runs.files import PathLike, as_model
 from keyss.runs.folder import check_not_published
-from keyss.runs.revealing import reveal_any
+from keyss.runs.revealing import reveal_secret
 
 _KEPT = 0.99  # share; a secret with fewer Gaussians left counts as lost
 
@@ -74,19 +74,19 @@ def convert(
     if not is_standard(path):
         check_not_published(path)
     before = as_model(model if source is None else source)
-    opened = [reveal_any(before, key, target) for key in keys]
+    opened = [reveal_secret(before, key, target) for key in keys]
     data = model_bytes(path, with_extras(before, source, before))
     after = before if holds(path, data, before) else model_of_bytes(path, data)  # a copy takes memory
     secrets = tuple(
         KeptSecret(
-            each.recovered.found, _size_left(after, key, target), "bytes" if each.file else "Gaussians"
+            secret.recovered.found, _size_left(after, key, target), "bytes" if secret.file else "Gaussians"
         )
-        for key, each in zip(keys, opened, strict=True)
+        for key, secret in zip(keys, opened, strict=True)
     )
     size = None if source is None or is_standard(source) else source.stat().st_size
     psnr = psnr_between(before.to(target), after.to(target)) if is_visible(before.to(target)) else math.nan
     result = Conversion(after, size, len(data), psnr, keeps_low_bits(path), secrets)
-    lost = [number for number, each in enumerate(secrets, 1) if not each.kept]
+    lost = [number for number, secret in enumerate(secrets, 1) if not secret.kept]
     if lost and not (force or dry_run):
         raise QualityError(_refusal(path, result, lost))
     if dry_run:
@@ -102,7 +102,7 @@ def convert(
 def _size_left(model: Gaussians, key: str, device: torch.device) -> int:
     """Gaussians or bytes of the secret that survived the conversion; 0 if none did."""
     try:
-        return reveal_any(model, key, device).recovered.found
+        return reveal_secret(model, key, device).recovered.found
     except (WrongKeyError, InputError, UsageError):
         return 0
 

@@ -14,7 +14,7 @@ from keyss.fitting.image_metrics import quality
 from keyss.fitting.plain import FitResult, fit_scene
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
-from keyss.runs.files import CONFIG, METRICS, MODEL, Background, PathLike, as_scene, path_of
+from keyss.runs.files import CONFIG, METRICS, MODEL, PathLike, as_scene, path_of
 from keyss.runs.folder import RunFolder, read_manifest
 from keyss.runs.planning import check_room, cost_of_fit
 from keyss.runs.run_records import FitMetrics, FitRunConfig
@@ -26,19 +26,17 @@ def with_seed(config: FitConfig, interrupted: Path | None, *names: str) -> FitCo
     `interrupted`: the run's folder; `names`: the path to its config among its arguments.
     """
     running = None if interrupted is None else read_manifest(interrupted).running
-    found: Any = running and running.arguments
+    value: Any = running and running.arguments
     for name in (*names, "seed"):
-        found = found.get(name) if isinstance(found, dict) else None
-    return config.with_seed(found if isinstance(found, int) else None)
+        value = value.get(name) if isinstance(value, dict) else None
+    return config.with_seed(value if isinstance(value, int) else None)
 
 
 def fit(
     scene: PathLike | Scene,
     *,
     config: FitConfig | None = None,
-    width: int | None = None,
-    background: Background = None,
-    skip_missing: bool = False,
+    views: ViewOptions = ViewOptions(),
     device: Backend = "auto",
     out: PathLike | None = None,
     overwrite: bool = False,
@@ -47,21 +45,16 @@ def fit(
 ) -> FitResult:
     """Train plain 3DGS on a scene.
 
-    `config`: by default 1,000 steps and 30,000 Gaussians, on CUDA 30,000 and a million. `width`,
-    `background`, `skip_missing`: see `load_scene`. `out` (a folder) gets `model.ply`, and `private/`
-    with `config.json`, `metrics.json` and checkpoints, from which `resume` continues. Without a seed in
-    `config` the run uses a random one, which `config.json` records. Raises KeyssError, and Interrupted on
-    Ctrl-C.
+    `config`: by default 1,000 steps and 30,000 Gaussians, on CUDA 30,000 and a million. `views`: how photos
+    are read. `out` (a folder) gets `model.ply`, and `private/` with `config.json`, `metrics.json` and
+    checkpoints, from which `resume` continues. Without a seed in `config` the run uses a random one, which
+    `config.json` records. Raises KeyssError, and Interrupted on Ctrl-C.
     """
     started = time.monotonic()
     interrupted = Path(out) if resume and out is not None else None
     target = resolve_device(device)
     config = with_seed(config or preset_for("default", target.type), interrupted, "config")
-    settings = FitRunConfig(
-        scene=path_of(scene),
-        views=ViewOptions.of(width, background, skip_missing),
-        config=config,
-    )
+    settings = FitRunConfig(scene=path_of(scene), views=views, config=config)
     folder = None
     if out is not None:
         folder = RunFolder(
@@ -72,7 +65,7 @@ def fit(
             overwrite=overwrite,
             resume=resume,
         )
-    loaded = as_scene(scene, settings.views)
+    loaded = as_scene(scene, views)
     cost = cost_of_fit(loaded, config, target)
     check_room(cost, None if out is None else Path(out))
     if reporter and not resume:

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
+from pathlib import Path
 
 from keyss.api.model_frames import in_frame_of
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.scene import Scene, ViewOptions
+from keyss.files.models import is_model_path
+from keyss.fitting.config import FitConfig
 from keyss.keys import normalized_key
 from keyss.methods import registry
 from keyss.methods.method import Method, MethodOptions, Plan, Source
 from keyss.rendering.orbit import is_model
-from keyss.runs.files import PathLike, as_3dgs_model, as_scene, path_of
+from keyss.runs.files import METRICS, MODEL, PathLike, as_3dgs_model, as_scene, path_of, plain_names
+from keyss.runs.json_records import read_record
 from keyss.runs.planning import Cost
-from keyss.runs.run_records import HideMetrics
+from keyss.runs.run_records import FitMetrics, HideMetrics
 
 _READERS = 2  # threads that read files
 
@@ -32,42 +37,54 @@ class Secret:
 
 
 @dataclass(frozen=True)
+class SecretFile:
+    """A file to hide, and its key."""
+
+    file: PathLike | bytes
+    key: str = field(repr=False)
+    name: str = ""  # displayed when the file is revealed; default: its own name
+
+
+@dataclass(frozen=True)
 class HideResult:
     """The result of `hide`."""
 
     stego: Gaussians | None = None  # publish this; None after a dry run
-    metrics: HideMetrics | None = None  # None after a dry run
-    plan: Plan | None = None  # only after a dry run, like `cost`
+    metrics: HideMetrics | None = None  # of hidden scenes; None after a dry run
+    plan: Plan | None = None  # of hidden scenes; only after a dry run, like `cost`
     cost: Cost | None = None
     survives: bool = False  # whether the secrets survive conversion to other formats
+    psnr: float | None = None  # of hidden files: dB of the stego model's views to the cover's, at most 120
 
 
 def method_for(
-    chosen: str | MethodOptions, secrets: Sequence[Secret], preset: str | None, device: str
+    chosen: str | MethodOptions, secrets: Sequence[Secret] | Sequence[SecretFile], device: str
 ) -> tuple[Method, MethodOptions]:
     """A method and its options, by default its preset for the device.
 
     Raises UsageError if the method does not support these secrets or keys.
     """
-    if isinstance(secrets, Secret) or not isinstance(secrets, Sequence) or isinstance(secrets, str):
+    if not isinstance(secrets, Sequence) or isinstance(secrets, str):
         raise UsageError("secrets: expected a list, such as [Secret(scene, key)]")
-    for each in secrets:
-        if not isinstance(each, Secret):
-            raise UsageError(f"secrets: expected Secret(scene, key), got {type(each).__name__}")
+    for secret in secrets:
+        if not isinstance(secret, Secret | SecretFile):
+            raise UsageError(f"secrets: expected Secret(scene, key), got {type(secret).__name__}")
+    if len(set(map(type, secrets))) > 1:
+        raise UsageError("secrets: expected scenes or files, got both: hide them in two covers")
     if isinstance(chosen, MethodOptions):
         method, options = registry.of_options(chosen), chosen
-        if preset is not None:
-            raise UsageError("`preset` is for a method's name: options have their own schedule")
     else:
         method = registry.get(chosen)
-        options = method.options.preset(preset or "default", device)
+        options = method.options.preset("default", device)
     if not 1 <= len(secrets) <= method.max_secrets:
         raise UsageError(
             f"expected 1 to {method.max_secrets} secrets for the method {method.name}, got {len(secrets)}"
         )
+    if isinstance(secrets[0], SecretFile) and method.name != registry.DEFAULT:
+        raise UsageError(f"the method {method.name} hides scenes only, no files")
     keys = [secret.key for secret in secrets]
     if method.capabilities.keys:
-        check_keys(keys)
+        _check_keys(keys)
     elif any(keys):
         raise UsageError(
             f"the method {method.name} has no keys, as whoever has both files can see the secret: give none"
@@ -75,55 +92,121 @@ def method_for(
     return method, options
 
 
-def sources_of(
-    sources: Sequence[PathLike | Scene | Gaussians],
-    models: Sequence[PathLike | Gaussians | None],
-    keys: Sequence[str],
-    views: ViewOptions,
-) -> list[Source]:
-    """The cover and the secrets with their photos and plain models; a source may be its own model.
+def check_arguments(out: PathLike | None, min_psnr: float | None) -> None:
+    """Raise UsageError for the name of a model as the folder, and for a limit that is not a number."""
+    if out is not None and is_model_path(out):
+        raise UsageError(
+            f"{out}: expected the name of a folder; the format of the model in it follows from `publish`"
+        )
+    if min_psnr is not None and not math.isfinite(min_psnr):
+        raise UsageError(f"`min_psnr`: expected a number of dB, got {min_psnr}")
 
-    `keys`: one per secret. Raises UsageError and InputError.
-    """
-    given: list[tuple[PathLike | Gaussians | None, bool]] = []  # models, and whether there are photos
-    for index, (source, model) in enumerate(zip(sources, models, strict=True)):
-        photos = isinstance(source, Scene) or not is_model(source)
-        if not photos:
-            if model is not None and model is not source and path_of(model) != (path_of(source) or ""):
-                argument = "model" if index else "cover_model"
-                what = "a source in memory" if isinstance(source, Gaussians) else source
-                raise UsageError(f"{what} is a model itself: leave out `{argument}`")
-            model = source  # type: ignore[assignment]
-        given.append((model, photos))
-    names = ["the cover"] + ["the secret"] * (len(given) - 1)
-    # Reading large files takes seconds each, mostly without the GIL.
-    with ThreadPoolExecutor(_READERS) as readers:
-        found = readers.map(_read_visible, [model for model, _ in given], names)
-        loaded = [
-            as_scene(source, views) if photos else None
-            for source, (_, photos) in zip(sources, given, strict=True)
-        ]
-        placed = [
-            in_frame_of(scene, scene.to_scene_frame(model), path, source)
-            if scene is not None and model is not None and path is not None
-            else model
-            for model, scene, source, (path, _) in zip(found, loaded, sources, given, strict=True)
-        ]
+
+def check_not_given(**for_scenes: object) -> None:
+    """Raise UsageError for an argument that hidden files do not use."""
+    for name, value in for_scenes.items():
+        if value is not None and value is not False:
+            raise UsageError(f"`{name}` is for hidden scenes, not for files: leave it out")
+
+
+@dataclass(frozen=True)
+class Given:
+    """The cover and the secrets as they were given, the cover first."""
+
+    scenes: tuple[PathLike | Scene | Gaussians, ...]
+    models: tuple[PathLike | Gaussians | None, ...]  # plain models
+    keys: tuple[str, ...]  # one per secret
+
+    @staticmethod
+    def of(
+        cover: PathLike | Scene | Gaussians,
+        cover_model: PathLike | Gaussians | None,
+        secrets: Sequence[Secret],
+    ) -> Given:
+        scenes = (cover, *(secret.scene for secret in secrets))
+        models = (cover_model, *(secret.model for secret in secrets))
+        return Given(scenes, models, tuple(secret.key for secret in secrets))
+
+    @property
+    def photos(self) -> list[bool]:
+        """For each scene, whether it has photos; others are models themselves."""
+        return [isinstance(scene, Scene) or not is_model(scene) for scene in self.scenes]
+
+    @property
+    def paths(self) -> list[Path]:
+        """All files and folders among the arguments."""
+        return [Path(source) for source in (*self.scenes, *self.models) if isinstance(source, str | Path)]
+
+    def read(self, views: ViewOptions) -> list[Source]:
+        """Read photos and models. Raises UsageError and InputError."""
+        places = list(map(self._model_of, range(len(self.scenes))))
+        names = ["the cover"] + ["the secret"] * len(self.keys)
+        # Reading large files takes seconds each, mostly without the GIL.
+        with ThreadPoolExecutor(_READERS) as readers:
+            models = readers.map(_read_visible, places, names)
+            sources = []
+            for scene, photos, key in zip(self.scenes, self.photos, ("", *self.keys), strict=True):
+                sources.append(Source(None, photos, key, as_scene(scene, views) if photos else None))
+            for index, model in enumerate(models):
+                place, loaded = places[index], sources[index].loaded
+                if model is not None and loaded is not None and place is not None:
+                    model = in_frame_of(loaded, loaded.to_scene_frame(model), place, self.scenes[index])
+                sources[index] = replace(sources[index], given=model)
+        return sources
+
+    def _model_of(self, index: int) -> PathLike | Gaussians | None:
+        """The plain model of a scene, which may be a model itself. Raises UsageError for two models."""
+        scene, model = self.scenes[index], self.models[index]
+        if isinstance(scene, Scene) or not is_model(scene):
+            return model
+        if model is not None and model is not scene and path_of(model) != (path_of(scene) or ""):
+            argument = "model" if index else "cover_model"
+            what = "a source in memory" if isinstance(scene, Gaussians) else scene
+            raise UsageError(f"{what} is a model itself: leave out `{argument}`")
+        return scene
+
+    def with_renders(self, sources: Sequence[Source], views: ViewOptions, *, train: bool) -> list[Source]:
+        """Render the images of scenes without photos; `train`: those of training views too."""
         return [
-            Source(model, photos, key, scene)
-            for model, (_, photos), key, scene in zip(placed, given, ["", *keys], loaded, strict=True)
+            source
+            if source.photos
+            else replace(source, loaded=as_scene(scene, views, train_pictures=train, model=source.given))
+            for scene, source in zip(self.scenes, sources, strict=True)
         ]
 
+    def plain_steps(self, sources: Sequence[Source], fits: Sequence[FitConfig]) -> list[int | None]:
+        """Training steps of the plain models; None: a given model, unknown."""
+        return [
+            fit.iterations if source.given is None else _steps_of(model)
+            for source, model, fit in zip(sources, self.models, fits, strict=True)
+        ]
 
-def _read_visible(model: PathLike | Gaussians | None, what: str) -> Gaussians | None:
+    def models_to_write(self, sources: Sequence[Source]) -> dict[str, Gaussians]:
+        """Plain models by file name, without those that the user gave as files."""
+        return {
+            name: source.model
+            for name, source, scene in zip(plain_names(len(self.keys)), sources, self.scenes, strict=True)
+            if isinstance(scene, Scene | Gaussians) or source.photos
+        }
+
+
+def _steps_of(model: PathLike | Gaussians | None) -> int | None:
+    """Training steps of a given plain model, if `fit` wrote it."""
+    if model is None or isinstance(model, Gaussians) or Path(model).name != MODEL:
+        return None
+    metrics = Path(model).parent / METRICS
+    return read_record(metrics, FitMetrics).iterations if metrics.is_file() else None
+
+
+def _read_visible(source: PathLike | Gaussians | None, what: str) -> Gaussians | None:
     """Read the model, if there is one. Raises UsageError if all of it is transparent."""
-    found = None if model is None else as_3dgs_model(model, what)
-    if found is not None and not (found.opacities >= DRAWN_OPACITY).any():
+    model = None if source is None else as_3dgs_model(source, what)
+    if model is not None and not (model.opacities >= DRAWN_OPACITY).any():
         raise UsageError(f"{what}'s model is invisible: all of its Gaussians are transparent")
-    return found
+    return model
 
 
-def check_keys(keys: Sequence[str]) -> None:
+def _check_keys(keys: Sequence[str]) -> None:
     """Raise UsageError for invalid keys, and for two keys that normalise to the same text."""
     for (i, a), (j, b) in combinations(enumerate(map(normalized_key, keys), 1), 2):
         if a == b:

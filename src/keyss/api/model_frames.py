@@ -47,9 +47,9 @@ def in_frame_of(scene: Scene, model: Gaussians, source: PathLike | Gaussians, fo
     if as_it_is >= one_colour or isinstance(source, Gaussians):
         return model
     moved = [frame.apply_gaussians(model) for frame in _frames(Path(source), folder)]
-    best = max(moved, key=lambda each: mean_psnr(each, views, scene.background), default=model)
-    found = mean_psnr(best, views, scene.background)
-    if found >= one_colour:
+    best = max(moved, key=lambda frame_model: mean_psnr(frame_model, views, scene.background), default=model)
+    best_psnr = mean_psnr(best, views, scene.background)
+    if best_psnr >= one_colour:
         text = f"is moved into the frame of its photos, as {_NERFSTUDIO} beside it says"
     else:
         best = model
@@ -65,8 +65,8 @@ def in_frame_of(scene: Scene, model: Gaussians, source: PathLike | Gaussians, fo
 def _psnr_of_one_colour(views: tuple[View, ...]) -> float:
     """Mean PSNR in dB of the mean colour of each photo."""
     photos = [view.photo(torch.device("cpu")) for view in views]
-    flat = [each.mean((0, 1), keepdim=True).expand_as(each) for each in photos]
-    return sum(psnr(one, each) for one, each in zip(flat, photos, strict=True)) / len(photos)
+    flat = [photo.mean((0, 1), keepdim=True).expand_as(photo) for photo in photos]
+    return sum(psnr(one, photo) for one, photo in zip(flat, photos, strict=True)) / len(photos)
 
 
 def _frames(model: Path, folder: object) -> Iterator[Similarity]:

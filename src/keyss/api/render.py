@@ -21,7 +21,7 @@ from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import checked_size, turntable
 from keyss.runs.estimates import seconds_for
-from keyss.runs.files import METRICS, Background, PathLike, as_model, as_scene, stego_in
+from keyss.runs.files import METRICS, PathLike, as_model, as_scene, stego_in
 from keyss.runs.folder import RunFolder, write_again
 from keyss.runs.open_run import open_run
 from keyss.runs.planning import view_seconds
@@ -35,20 +35,17 @@ def render(
     cameras: PathLike | Scene | None = None,
     *,
     split: Split = "test",
-    width: int | None = None,
-    background: Background = None,
-    skip_missing: bool = False,
+    views: ViewOptions = ViewOptions(),
     device: Backend = "auto",
     out: PathLike | None = None,
     overwrite: bool = False,
 ) -> list[tuple[str, Tensor]]:
     """Render a model from the cameras of a scene, by default all around it; names and uint8 images [H, W, 3].
 
-    `width`, `background`, `skip_missing`: see `load_scene`; a skipped photo has no camera. Without `cameras`,
-    60 square images of `width` pixels, by default 400. `out` gets a PNG for each camera if it is a folder, or
+    `views`: how the scene is read; a skipped photo has no camera. Without `cameras`, 60 square images of
+    `views.width` pixels, by default 400. `out` gets a PNG for each camera if it is a folder, or
     an animation if its name ends in .webp. Raises KeyssError.
     """
-    views = ViewOptions.of(width, background, skip_missing)
     target = resolve_device(device)
     inputs = [Path(model)] if isinstance(model, str | Path) else []
     animated = out is not None and Path(out).suffix.lower() == ".webp"
@@ -60,15 +57,15 @@ def render(
         folder = RunFolder(out, "render", inputs=inputs, overwrite=overwrite)
     if cameras is None:
         gaussians = as_model(model).to(target)
-        behind = torch.zeros(3) if background is None else checked_background(background)
-        chosen = turntable(gaussians, checked_size(width))
+        background = torch.zeros(3) if views.background is None else checked_background(views.background)
+        chosen = turntable(gaussians, checked_size(views.width))
     else:
         scene = as_scene(cameras, views)
-        gaussians, behind = scene.to_scene_frame(as_model(model)).to(target), scene.background
+        gaussians, background = scene.to_scene_frame(as_model(model)).to(target), scene.background
         chosen = [
             view.camera for view in {"test": scene.test, "train": scene.train, "all": scene.views}[split]
         ]
-    pictures = renders_of(gaussians, chosen, behind)
+    pictures = renders_of(gaussians, chosen, background)
     if animated:
         write_bytes(str(out), animation_bytes([image for _, image in pictures]))
     if folder:
@@ -94,7 +91,7 @@ def evaluate(
     target, reporter = resolve_device(device), reporter or Reporter()
     with reporter.waiting("opening the secrets", len(keys) * seconds_for("reveal", stego_in(Path(run)))):
         opened = open_run(run, keys)
-    if wrong_keys is not None and all(each.decode is None for each in opened.opened):
+    if wrong_keys is not None and all(secret.decode is None for secret in opened.opened):
         raise UsageError(
             f"the method {opened.config.method} has no decoder, so wrong keys show nothing: leave out "
             "`wrong_keys`"
@@ -105,20 +102,25 @@ def evaluate(
         models = [stego, *(secret.reveal(stego).to(target) for secret in opened.opened)]
         baselines = [None if model is None else model.to(target) for model in opened.baselines()]
     tries = WRONG_KEYS if wrong_keys is None else wrong_keys
-    decoded = tries * sum(each.decode is not None for each in opened.opened)
+    decoded = tries * sum(secret.decode is not None for secret in opened.opened)
     seconds = sum(
         (1 + decoded) * len(scene.test) * view_seconds(target.type, len(model), scene)
         for model, scene in zip(models, scenes, strict=True)
     )
     with reporter.waiting("comparing renders", seconds):
+        shown = list(map(compare, models, baselines, scenes))
+        baseline = replace(
+            opened.metrics.baseline,
+            cover=shown[0].plain,
+            secrets=tuple(render.plain for render in shown[1:]),
+            gaussians=tuple(None if model is None else len(model) for model in baselines),
+        )
         measured = measure_hiding(
             stego,
             opened.opened,
             scenes,
-            list(map(compare, models, baselines, scenes)),
-            gaussians=[None if model is None else len(model) for model in baselines],
-            steps=opened.metrics.baseline.steps,
-            equal=opened.metrics.baseline.equal,
+            shown,
+            baseline,
             wrong_keys=tries,
             seed=opened.metrics.seed,
         )

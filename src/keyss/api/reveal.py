@@ -6,25 +6,16 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-from keyss.channels import open_payload
 from keyss.core.errors import KeyssWarning, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import check_not_an_input, check_output_file, write_bytes
-from keyss.files.inputs import is_standard
-from keyss.files.models import check_model_output, is_model_path, write_model
-from keyss.methods.hidden import Frame, HiddenFile, OpensAFileError
+from keyss.files.inputs import check_standard_output, is_standard, write_standard_output
+from keyss.files.models import is_model_path, write_model
+from keyss.methods.hidden import Frame
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import PathLike, as_model
 from keyss.runs.folder import check_not_published
-from keyss.runs.revealing import (
-    Revealed,
-    Verification,
-    check_model,
-    check_secret,
-    reveal_any,
-    reveal_model,
-    revealed_file,
-)
+from keyss.runs.revealing import Revealed, Verification, check_model, check_secret, reveal_secret
 
 
 def reveal(
@@ -47,54 +38,48 @@ def reveal(
     keys (`keyss.methods.companion`). Some of these methods give a model that a network decodes
     (`keyss.core.picture_network`), which is no 3DGS model.
 
-    `out` (a file) gets the secret: a scene for the suffix of a model (.ply, .spz, ...), else a file. Raises
-    WrongKeyError for a key that opens nothing, InputError for a damaged file or if less than 10 % of the
-    secret is left. Warns (KeyssWarning) of losses and of foreign Gaussians.
+    `out` (a file) gets the secret: a scene in the format of the suffix (.ply, .spz, ...), or the bytes of a
+    file. Raises UsageError for a suffix that does not suit what the key opens, WrongKeyError for a key that
+    opens nothing, InputError for a damaged file or if less than 10 % of the secret is left. Warns
+    (KeyssWarning) of losses and of foreign Gaussians.
     """
     target = resolve_device(device)
-    inputs = [] if isinstance(stego, Gaussians) else [Path(stego)]
-    if out is not None and not is_standard(out) and not is_model_path(out):
-        if key is None or companion or force or frame != "secret":
-            raise UsageError(
-                f"{out}: expected the name of a model, such as one that ends in .ply; `companion`, `force` "
-                "and `frame` are not for hidden files"
-            )
-        return _reveal_file(stego, key, Path(out), overwrite, inputs)
-    path = None if out is None else check_model_output(out, overwrite, inputs)
-    if path is not None and not is_standard(path):
+    path = None if out is None else Path(out)
+    if path is not None and is_standard(path):
+        check_standard_output()
+    elif path is not None:
+        check_not_an_input(path, [] if isinstance(stego, Gaussians) else [Path(stego)])
+        check_output_file(path, overwrite)
         check_not_published(path)
-    try:
-        found = reveal_model(
-            as_model(stego), key, device=target, frame=frame, force=force, companion=companion
-        )
-    except OpensAFileError as error:
-        if path is not None:
-            raise
-        return _with_warnings(revealed_file(error.file))
+    revealed = reveal_secret(as_model(stego), key, target, frame=frame, force=force, companion=companion)
     if not force:
-        found.check_usable()
+        revealed.check_usable()
     if path is not None:
-        write_model(path, found.gaussians)
-    return _with_warnings(found)
+        _write(revealed, path)
+    for sentence in revealed.warnings:
+        warnings.warn(sentence, KeyssWarning, stacklevel=2)
+    return revealed
 
 
-def _reveal_file(
-    stego: PathLike | Gaussians, key: str, out: Path, overwrite: bool, inputs: list[Path]
-) -> Revealed:
-    """`reveal` of a hidden file into `out`."""
-    check_not_an_input(out, inputs)
-    path = check_output_file(out, overwrite)
-    check_not_published(path)
-    file = HiddenFile.of(open_payload(as_model(stego), key))
-    write_bytes(path, file.data)
-    return _with_warnings(revealed_file(file))
-
-
-def _with_warnings(found: Revealed) -> Revealed:
-    """Warn (KeyssWarning) of what is missing."""
-    for sentence in found.warnings:
-        warnings.warn(sentence, KeyssWarning, stacklevel=3)
-    return found
+def _write(revealed: Revealed, path: Path) -> None:
+    """Write the secret. Raises UsageError for the name of another kind of file."""
+    file = revealed.file
+    if file is None:
+        if not (is_standard(path) or is_model_path(path)):
+            raise UsageError(
+                f"this key opens a scene of {revealed.recovered.found:,} Gaussians: name the output as a "
+                f"model, such as {path.stem}.ply, not {path.name}"
+            )
+        write_model(path, revealed.gaussians)
+    elif is_standard(path):
+        write_standard_output(file.data)
+    elif is_model_path(path) and path.suffix.lower() != Path(file.name).suffix.lower():
+        raise UsageError(
+            f"this key opens a file of {len(file.data):,} bytes, {file.name!r}: name the output like it, not "
+            f"{path.name}"
+        )
+    else:
+        write_bytes(path, file.data)
 
 
 def verify(
@@ -117,10 +102,10 @@ def verify(
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", KeyssWarning)
             try:
-                revealed = reveal_any(gaussians, key, target)
+                revealed = reveal_secret(gaussians, key, target)
             except WrongKeyError as error:
                 which = f"key {number} of {len(given)}: " if len(given) > 1 else ""
                 raise WrongKeyError(f"{which}{error}") from error
-        problems = [str(each.message) for each in caught if issubclass(each.category, KeyssWarning)]
+        problems = [str(warning.message) for warning in caught if issubclass(warning.category, KeyssWarning)]
         secrets.append(check_secret(revealed, problems))
     return Verification(name, check_model(gaussians), tuple(secrets))

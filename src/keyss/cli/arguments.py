@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
 from keyss.core.errors import InputError, UsageError
+
+if TYPE_CHECKING:
+    from keyss.core import ViewOptions
 
 
 def optional(metavar: str, help: str, default: str = "", aliases: list[str] | None = None) -> Any:
@@ -28,6 +31,10 @@ Seed = Annotated[int | None, optional("N", "Seed of all random numbers, to repea
 KeyFiles = Annotated[
     UseAppendAction[tuple[Path, ...]],
     optional("FILE", "Key file, one for each secret; - for stdin.", "KEYSS_KEY or a prompt"),
+]
+KeyFilesToCheck = Annotated[
+    UseAppendAction[tuple[Path, ...]],
+    optional("FILE", "Key file of a secret to check; repeat for more.", "KEYSS_KEY, else no key"),
 ]
 Preset = Annotated[
     Literal["quick", "default", "full"],
@@ -64,6 +71,12 @@ class Photos:
         bool, switch("Skip photos that are missing or damaged or have no usable camera.")
     ] = False
 
+    def views(self) -> ViewOptions:
+        """As an argument of the public functions."""
+        from keyss.core import ViewOptions
+
+        return ViewOptions(**vars(self))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Training:
@@ -84,12 +97,12 @@ PHOTOS, TRAINING = Photos(), Training()
 def changed_flags(options: Any) -> list[str]:
     """Flags whose options, also in groups, differ from their defaults."""
     flags = []
-    for each in fields(options):
-        value = getattr(options, each.name)
+    for field in fields(options):
+        value = getattr(options, field.name)
         if is_dataclass(value):
             flags += changed_flags(value)
-        elif value != each.default:
-            flags.append(flag(each.name))
+        elif value != field.default:
+            flags.append(flag(field.name))
     return flags
 
 
@@ -110,3 +123,12 @@ def check_seed(seed: int) -> int:
     if not 0 <= seed < 1 << 32:
         raise UsageError(f"--seed: expected 0 to {(1 << 32) - 1}, got {seed}")
     return seed
+
+
+def verb(name: str) -> Any:
+    """The function `name` of `keyss`; a line says that it is loaded, as importing torch takes seconds."""
+    import keyss
+    from keyss.progress import waiting
+
+    with waiting("starting", 2.0):
+        return getattr(keyss, name)

@@ -45,8 +45,8 @@ Exit status: 0 done, 2 wrong usage, 3 wrong key, 4 unreadable input, 5 unwritabl
 
 def command(name: str) -> Callable[..., None]:
     """The function of a command."""
-    found: Callable[..., None] = getattr(importlib.import_module(f"keyss.{MODULES[name]}"), name)
-    return found
+    function: Callable[..., None] = getattr(importlib.import_module(f"keyss.{MODULES[name]}"), name)
+    return function
 
 
 def parse_target(name: str, arguments: Sequence[str]) -> Callable[..., None]:

@@ -37,7 +37,7 @@ def doctor(*, device: Device = "auto") -> None:
     optional: dict[str, Callable[[], str]] = {
         "GPU": _gpu,
         "kernel cache": _cache,
-        **{f"[{name}]": partial(_extra, name, *each) for name, each in _EXTRAS.items()},
+        **{f"[{name}]": partial(_extra, name, *extra) for name, extra in _EXTRAS.items()},
         "splat-transform": find_splat_transform,
     }
     broken = []

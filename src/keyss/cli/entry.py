@@ -212,12 +212,12 @@ def as_flags(message: str, options: Collection[str]) -> str:
     Names without a value are replaced only if they are in `options`.
     """
 
-    def flags(found: re.Match[str]) -> str:
+    def flags(quoted: re.Match[str]) -> str:
         words = []
-        for name, is_set, value in (part.strip().partition("=") for part in found[1].split(",")):
+        for name, is_set, value in (part.strip().partition("=") for part in quoted[1].split(",")):
             option = _RENAMED.get(name, name)
             if not name.isidentifier() or not (is_set or option in options):
-                return found[0]
+                return quoted[0]
             words.append(f"--{option.replace('_', '-')}")
             words += [value.strip("\"'")] if value not in ("", "True") else []
         return " ".join(words)
@@ -229,10 +229,10 @@ def options_of(command: Any) -> dict[str, Any]:
     """Names and types of the options of a command, those of groups included."""
     from tyro.conf import Positional
 
-    found: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     for name, hint in get_type_hints(command, include_extras=True).items():
         if is_dataclass(group := getattr(hint, "__origin__", hint)):
-            found |= options_of(group)
+            options |= options_of(group)
         elif name != "return" and Positional not in getattr(hint, "__metadata__", ()):
-            found[name.rstrip("_")] = hint
-    return found
+            options[name.rstrip("_")] = hint
+    return options

@@ -7,6 +7,7 @@ from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, make_dataclass, replace
 from pathlib import Path
+from types import FunctionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from tyro.conf import OmitArgPrefixes, UseAppendAction, arg
@@ -27,13 +28,14 @@ from keyss.cli.arguments import (
     flag,
     optional,
     switch,
+    verb,
 )
 from keyss.cli.keys import keys
-from keyss.cli.verbs import verb
 from keyss.core.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from keyss.methods.method import CommandLineOption, Method, MethodOptions
+    from keyss import HideResult, Secret, SecretFile
+    from keyss.methods.method import CommandLineOption, MethodOptions
 
 _HOW_TO_PUBLISH = {False: "publish this file unchanged", True: "publish this file; it may be converted"}
 
@@ -67,7 +69,7 @@ class Details:
             "{appended,colours}",
             "With --publish converted: appended Gaussians hold everything, but are visible in the file; "
             "colours hold less and show less.",
-            "appended for scenes, colours for files",
+            "appended",
         ),
     ] = None
 
@@ -93,18 +95,19 @@ class HideArguments:
     ] = ()
     key_file: KeyFiles = ()
     publish: Annotated[
-        Literal["unchanged", "converted"],
-        arg(
-            help="unchanged: a file that must stay unchanged, in which the secret goes unnoticed; becomes "
-            "converted, with a warning, if a scene has too little room. converted: a .ply that may be "
-            "converted later; whoever inspects it sees that it holds something."
+        Literal["unchanged", "converted"] | None,
+        optional(
+            "{unchanged,converted}",
+            "unchanged: a file that must stay as it is; the secret lies in low bits. converted: a .ply that "
+            "may be converted later; inspection shows that it holds something.",
+            "unchanged or, with a warning, converted if the cover has too little capacity",
         ),
-    ] = "unchanged"
+    ] = None
     format: Annotated[
         Literal["ply", "spz", "sog", "compressed-ply"] | None,
         optional(
             "{ply,spz,sog,compressed-ply}",
-            "With --publish unchanged: this file and nothing else; all but ply hold small secrets only.",
+            "Publish unchanged in this format; all but ply hold small secrets only.",
             "the cover's",
         ),
     ] = None
@@ -132,41 +135,33 @@ def hide(args: HideArguments) -> None:
 
     example: keyss hide --cover cover.ply --secret-file letter.pdf --key-file key.txt -o runs/letter
     """
-    check_exists(args.cover, args.details.cover_model)
-    check_exists(*args.secret, *args.secret_file, *args.key_file, *args.details.secret_model)
+    details = args.details
+    check_exists(args.cover, details.cover_model)
+    check_exists(*args.secret, *args.secret_file, *args.key_file, *details.secret_model)
+    options = _method_options(args)
     if args.secret_file:
-        _method_options(args)  # refuses wrong ones
-        _hide_files(args)
-    elif args.secret:
-        verb("hide")
-        _hide_scenes(args, _method_options(args))
-    else:
+        used = "cover secret_file key_file publish format out overwrite device channel dry_run"
+        if unused := [name for name in changed_flags(args) if name not in map(flag, used.split())]:
+            raise UsageError(f"--secret-file does not use {unused[0]}: leave out {unused[0]}")
+    elif not args.secret:
         raise UsageError("no secret: give --secret SCENE or --secret-file FILE, one for each secret")
-
-
-def _hide_scenes(args: HideArguments, options: MethodOptions) -> None:
-    import keyss
+    run = verb("hide")
     from keyss import progress
-    from keyss.cli.tables import print_files, print_hiding, print_plan
-    from keyss.methods import registry
-    from keyss.runs.files import COMPANIONS, LOOK, STEGOS
 
-    method = registry.get(args.method)
-    secrets = _secrets(args, method)
-    idle = _ignored_training_flags(args)
+    idle = "" if args.secret_file else _ignored_training_flags(args)
     if idle and not options.may_train:
         raise UsageError(
             f"{idle}: nothing is trained, as models of all scenes are given and --method {options.method} "
             "does not fine-tune them: leave out such options"
         )
-    result = keyss.hide(
+    result = run(
         args.cover,
-        secrets,
+        _secrets(args),
         method=options,
-        **vars(args.photos),
-        cover_model=args.details.cover_model,
-        bound=args.details.bound,
-        min_psnr=args.details.min_psnr,
+        views=args.photos.views(),
+        cover_model=details.cover_model,
+        bound=details.bound,
+        min_psnr=details.min_psnr,
         device=args.device,
         out=args.out,
         overwrite=args.overwrite,
@@ -180,50 +175,75 @@ def _hide_scenes(args: HideArguments, options: MethodOptions) -> None:
             f"keyss: warning: {idle} had no effect: the secrets fit as they are, and nothing is trained",
             file=sys.stderr,
         )
+    _print_result(args, result)
+
+
+def _print_result(args: HideArguments, result: HideResult) -> None:
+    """Print measurements, files and what to do with them, or the plan of a dry run."""
+    from keyss import progress
+    from keyss.cli.tables import print_files, print_hiding, print_plan
+    from keyss.methods import registry
+    from keyss.runs.files import COMPANIONS, LOOK, STEGOS
+
     if result.plan is not None and result.cost is not None:
-        print_plan(method.name, result.plan, result.cost)
+        print_plan(args.method, result.plan, result.cost)
         return
-    assert result.metrics is not None
-    if progress.level >= 0:
+    if result.psnr is not None:
+        for file in args.secret_file:
+            what = "which fit" if args.dry_run else "revealed again from the published file"
+            progress.say(f"{file.name}: {file.stat().st_size:,} bytes, {what}")
+        progress.say(f"PSNR between renders of the cover before and after: {result.psnr:.0f} dB")
+        if args.dry_run:
+            print("Dry run: nothing was written.")
+            return
+    if result.metrics is not None and progress.level >= 0:
         print_hiding(result.metrics, brief=progress.level < 1)
-    what = "the cover with the secret in it" if options.trains or method.capabilities.keys else "the cover"
-    how = _HOW_TO_PUBLISH[result.survives]
-    print_files(
-        args.out,
-        {
-            **dict.fromkeys(STEGOS, f"{how}: {what}"),
+    method = registry.get(args.method)
+    what = (
+        ": the cover with the secret in it" if method.capabilities.keys or method.options().may_train else ""
+    )
+    files = dict.fromkeys(STEGOS, _HOW_TO_PUBLISH[result.survives] + what)
+    if result.metrics is not None:
+        files |= {
             LOOK: "cover before and after, secret and revealed: look here first; it shows the secret",
             COMPANIONS: "hand this over to whoever may see the secret: `keyss reveal --companion`",
             "private": "keep this private, or delete it: measurements, configuration, fitted models",
-        },
-    )
+        }
+    print_files(args.out, files)
     if not method.capabilities.keys:
         progress.say(f"The method {method.name} has no keys: whoever has both files can see the secret.")
-        return
-    progress.say(
-        "Send the key over another channel, and keep a copy: without it the secret is lost. Whoever has "
-        f"the file and the key runs `keyss reveal`; `keyss info {args.out}` prints all measurements."
-    )
+    else:
+        progress.say(
+            "Send the key over another channel, and keep a copy: without it the secret is lost. Whoever has "
+            "the file and the key runs `keyss reveal`"
+            + (f"; `keyss info {args.out}` prints all measurements." if result.metrics else ".")
+        )
 
 
-def _secrets(args: HideArguments, method: Method) -> list[Any]:
+def _secrets(args: HideArguments) -> list[Secret] | list[SecretFile]:
     """The secrets with their keys and models."""
-    import keyss
+    from keyss import Secret, SecretFile
     from keyss.files.file_kinds import identify_file
     from keyss.files.models import is_model_path
+    from keyss.methods import registry
 
+    if args.secret_file:
+        given = keys(args.key_file, len(args.secret_file), new=True)
+        return list(map(SecretFile, args.secret_file, given))
     count, models = len(args.secret), args.details.secret_model
-    for each in args.secret:
-        if each.is_file() and not is_model_path(each):
-            found = f"{each}: expected a scene folder or a model, found {identify_file(each)}"
-            raise InputError(f"{found}; --secret-file hides any file")
+    for path in args.secret:
+        if path.is_file() and not is_model_path(path):
+            kind = identify_file(path)
+            raise InputError(
+                f"{path}: expected a scene folder or a model, found {kind}; --secret-file hides any file"
+            )
     if models and len(models) != count:
         raise UsageError(
             f"expected no --secret-model or one for each of {count} secret(s), got {len(models)}"
         )
-    has_keys = method.capabilities.keys or args.key_file
+    has_keys = registry.get(args.method).capabilities.keys or args.key_file
     given = keys(args.key_file, count, new=True) if has_keys else [""] * count
-    return list(map(keyss.Secret, args.secret, given, models or (None,) * count))
+    return list(map(Secret, args.secret, given, models or (None,) * count))
 
 
 def _ignored_training_flags(args: HideArguments) -> str:
@@ -262,41 +282,6 @@ def _kind_of_device(args: HideArguments) -> str:
     return resolve_device(args.device).type
 
 
-def _hide_files(args: HideArguments) -> None:
-    import keyss
-    from keyss import progress
-    from keyss.channels import channel_for
-    from keyss.cli.tables import print_files
-    from keyss.progress import waiting
-    from keyss.runs.estimates import seconds_for
-    from keyss.runs.files import STEGOS
-
-    used = "cover secret_file key_file publish format out overwrite device channel dry_run"
-    if unused := [each for each in changed_flags(args) if each not in map(flag, used.split())]:
-        raise UsageError(f"--secret-file does not use {unused[0]}: leave out {unused[0]}")
-    files, channel = args.secret_file, args.details.channel or "colours"
-    secrets = list(map(keyss.SecretFile, files, keys(args.key_file, len(files), new=True)))
-    with waiting(f"hiding in {args.cover.name}", seconds_for("hide a file", args.cover)):
-        result = keyss.hide_files(
-            args.cover,
-            secrets,
-            publish=args.publish,
-            format=args.format,
-            channel=channel,
-            out=args.out,
-            overwrite=args.overwrite,
-            dry_run=args.dry_run,
-        )
-    for file in files:
-        what = "which fit" if args.dry_run else "revealed again from the published file"
-        progress.say(f"{file.name}: {file.stat().st_size:,} bytes, {what}")
-    progress.say(f"PSNR between renders of the cover before and after: {result.psnr:.0f} dB")
-    if args.dry_run:
-        print("Dry run: nothing was written.")
-        return
-    print_files(args.out, dict.fromkeys(STEGOS, _HOW_TO_PUBLISH[channel_for(args.publish, channel).survives]))
-
-
 def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
     """`hide` with the options of the method in `arguments`, for the parser.
 
@@ -308,30 +293,28 @@ def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
     chooser.add_argument("--method", nargs="?")
     asked = chooser.parse_known_args(arguments)[0].method
     name = asked if asked in registry.METHODS else registry.DEFAULT
-    flags = {each: set(map(flag, own_options(each))) for each in registry.METHODS}
+    flags = {method: set(map(flag, own_options(method))) for method in registry.METHODS}
     for argument in arguments:
         given = argument.partition("=")[0].replace("_", "-")
-        having = [each for each in flags if given in flags[each]]
+        having = [method for method in flags if given in flags[method]]
         if having and name not in having:
             known = ", ".join(sorted(flags[name])) or "none"
             raise UsageError(
                 f"{given} is an option of --method {' and '.join(having)}; --method {name} has: {known}"
             )
-    summaries = "; ".join(f"{each}: {modules.summary}" for each, modules in registry.METHODS.items())
+    summaries = "; ".join(f"{method}: {modules.summary}" for method, modules in registry.METHODS.items())
     methods: Any = Annotated[Literal[tuple(registry.METHODS)], arg(help=f"{summaries}.")]
-    own = make_dataclass("Own", map(_own_field, own_options(name).items()), frozen=True, kw_only=True)
-    own.__doc__ = f"Options that only the method {name} has."
+    options = make_dataclass("Own", map(_own_field, own_options(name).items()), frozen=True, kw_only=True)
+    options.__doc__ = f"Options that only the method {name} has."
     changed: list[tuple[str, Any, Any]] = [
         ("method", methods, field(default=name)),
-        ("own", Annotated[own, arg(name=name), OmitArgPrefixes], field(default=own())),
+        ("own", Annotated[options, arg(name=name), OmitArgPrefixes], field(default=options())),
     ]
     kind = make_dataclass("Arguments", changed, bases=(HideArguments,), frozen=True, kw_only=True)
 
-    def command(args: HideArguments) -> None:
-        hide(args)
-
+    command = FunctionType(hide.__code__, hide.__globals__, "hide")  # `hide` with other annotations
     command.__annotations__ = {"args": Annotated[kind, arg(name="")], "return": None}
-    command.__name__, command.__doc__ = "hide", hide.__doc__
+    command.__doc__ = hide.__doc__
     return command
 
 
@@ -352,8 +335,11 @@ def own_options(method: str) -> dict[str, tuple[Any, CommandLineOption]]:
     options = options_of(method)
     hints = get_type_hints(options, include_extras=True)
     return {
-        each.name: (get_args(hints[each.name])[0], replace(extra, default=extra.default or str(each.default)))
-        for each in fields(options)
-        for extra in getattr(hints[each.name], "__metadata__", ())
+        field.name: (
+            get_args(hints[field.name])[0],
+            replace(extra, default=extra.default or str(field.default)),
+        )
+        for field in fields(options)
+        for extra in getattr(hints[field.name], "__metadata__", ())
         if isinstance(extra, CommandLineOption)
     }

@@ -26,18 +26,18 @@ def keys(files: Sequence[Path], count: int, *, new: bool = False) -> list[str]:
         expected = "one --key-file" if count == 1 else f"one --key-file for each of {count} secrets"
         raise UsageError(f"expected {expected}, got {len(files)}")
     if files or VARIABLE in os.environ:
-        found = given_keys(files)
-        if len(found) != count:
+        chosen = given_keys(files)
+        if len(chosen) != count:
             raise UsageError(
                 f"{VARIABLE} holds one key, but there are {count} secrets: give --key-file for each"
             )
     elif not sys.stdin.isatty():
         raise UsageError(f"no key: give --key-file FILE, set {VARIABLE}, or run in a terminal for a prompt")
     else:
-        found = [_prompt(f"Key {i + 1} of {count}" if count > 1 else "Key", new) for i in range(count)]
+        chosen = [_prompt(f"Key {i + 1} of {count}" if count > 1 else "Key", new) for i in range(count)]
     if new:
-        warn_of_weak_keys(found)
-    return found
+        warn_of_weak_keys(chosen)
+    return chosen
 
 
 def given_keys(files: Sequence[Path]) -> list[str]:

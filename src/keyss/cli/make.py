@@ -6,12 +6,13 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from keyss.cli.arguments import (
     PHOTOS,
     TRAINING,
     Device,
+    KeyFilesToCheck,
     OutFolder,
     Overwrite,
     Photos,
@@ -22,9 +23,9 @@ from keyss.cli.arguments import (
     check_seed,
     optional,
     switch,
+    verb,
 )
 from keyss.cli.keys import given_keys, key_of_file
-from keyss.cli.verbs import verb
 from keyss.core.errors import UsageError
 
 ENOUGH_BITS = 64  # of a random key, which Argon2id makes as slow to find as 2^80 plain hashes
@@ -98,7 +99,7 @@ def fit(
     run(
         scene,
         config=replace(preset_for(preset, resolve_device(device).type), **training.schedule()),
-        **vars(photos),
+        views=photos.views(),
         device=device,
         out=out,
         overwrite=overwrite,
@@ -165,10 +166,7 @@ def convert(
     model: Annotated[Positional[Path], arg(metavar="IN", help="Model of any format, or - for stdin.")],
     out: Annotated[Positional[Path], arg(metavar="OUT", help="Model to write (.ply, .spz, .sog, ...).")],
     *,
-    key_file: Annotated[
-        UseAppendAction[tuple[Path, ...]],
-        optional("FILE", "Key of a secret that must survive; repeat for more.", "KEYSS_KEY, else no key"),
-    ] = (),
+    key_file: KeyFilesToCheck = (),
     force: Annotated[bool, switch("Write the model even if a secret is lost.")] = False,
     dry_run: Annotated[bool, switch("Report the cost, and write nothing.")] = False,
     overwrite: Overwrite = False,
@@ -192,7 +190,7 @@ def convert(
 
     given = given_keys(key_file)
     with waiting(f"converting {model.name}", seconds_to_convert(model, out, len(given))):
-        found = keyss.convert(
+        conversion = keyss.convert(
             model,
             out,
             given,
@@ -201,4 +199,4 @@ def convert(
             overwrite=overwrite,
             device=device,
         )
-    print_conversion(out, found, dry_run=dry_run)
+    print_conversion(out, conversion, dry_run=dry_run)

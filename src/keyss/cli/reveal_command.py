@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import Positional, arg
 
-from keyss.cli.arguments import Device, Overwrite, check_exists, optional, switch
+from keyss.cli.arguments import Device, KeyFiles, KeyFilesToCheck, Overwrite, check_exists, optional, switch
 from keyss.cli.keys import given_keys, keys
 from keyss.core.errors import InputError
 
@@ -15,10 +15,7 @@ from keyss.core.errors import InputError
 def reveal(
     stego: Annotated[Positional[Path], arg(metavar="FILE", help="Published model, or - for stdin.")],
     *,
-    key_file: Annotated[
-        UseAppendAction[tuple[Path, ...]],
-        optional("FILE", "Key file, or - for stdin.", "KEYSS_KEY or a prompt"),
-    ] = (),
+    key_file: KeyFiles = (),
     out: Annotated[
         Path,
         arg(
@@ -81,12 +78,7 @@ def reveal(
 def verify(
     model: Annotated[Positional[Path], arg(metavar="FILE", help="Model (.ply, .spz, ...), or - for stdin.")],
     *,
-    key_file: Annotated[
-        UseAppendAction[tuple[Path, ...]],
-        optional(
-            "FILE", "Key file, to check its secret too; repeat for several secrets.", "KEYSS_KEY, else no key"
-        ),
-    ] = (),
+    key_file: KeyFilesToCheck = (),
     json_: Annotated[bool, switch("Print JSON.", name="json")] = False,
     device: Device = "auto",
 ) -> None:
@@ -104,7 +96,7 @@ def verify(
 
     given = given_keys(key_file)
     with waiting(f"checking {model.name}", seconds_for("reveal" if given else "verify", model)):
-        found = keyss.verify(model, given, device=device)
-    (print_json if json_ else print_verification)(found)
-    if found.problems:
-        raise InputError(f"{model}: {'; '.join(found.problems)}")
+        checked = keyss.verify(model, given, device=device)
+    (print_json if json_ else print_verification)(checked)
+    if checked.problems:
+        raise InputError(f"{model}: {'; '.join(checked.problems)}")

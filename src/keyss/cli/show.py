@@ -18,9 +18,9 @@ from keyss.cli.arguments import (
     check_exists,
     optional,
     switch,
+    verb,
 )
 from keyss.cli.keys import keys_of_run
-from keyss.cli.verbs import verb
 from keyss.core.errors import UsageError
 
 _VECTOR = r"[-+.\de]+(,[-+.\de]+){2}"
@@ -138,7 +138,7 @@ def render(
 
     with waiting(f"rendering {model.name}", seconds_for("render", model)):
         images = keyss.render(
-            model, cameras, split=split, **vars(photos), device=device, out=out, overwrite=overwrite
+            model, cameras, split=split, views=photos.views(), device=device, out=out, overwrite=overwrite
         )
     print_written(out, f"{len(images)} image{'' if len(images) == 1 else 's'}")
 
@@ -166,8 +166,8 @@ def info(
     from keyss.runs.estimates import seconds_for
 
     with waiting(f"reading {path.name}", seconds_for("info", path)):
-        found = describe(path, capacity=capacity)
-    (print_json if json_ else print_info)(found)
+        described = describe(path, capacity=capacity)
+    (print_json if json_ else print_info)(described)
 
 
 def evaluate(

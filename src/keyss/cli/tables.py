@@ -55,8 +55,8 @@ def print_hiding(metrics: HideMetrics, *, brief: bool = False) -> None:
     if not brief:
         lines = [*_explanations(metrics, names, heads), *lines]
         units = {"capacity": "Gaussians", "capacity_bytes": "bytes"}
-        found = {unit: metrics.details[name] for name, unit in units.items() if name in metrics.details}
-        lines += [f"Capacity of the cover: {number:,} {unit}." for unit, number in found.items()]
+        capacities = {unit: metrics.details[name] for name, unit in units.items() if name in metrics.details}
+        lines += [f"Capacity of the cover: {number:,} {unit}." for unit, number in capacities.items()]
     for line in lines:
         print(line)
 
@@ -64,7 +64,7 @@ def print_hiding(metrics: HideMetrics, *, brief: bool = False) -> None:
 def _scene_rows(metrics: HideMetrics) -> list[dict[str, str]]:
     """A row for the cover and each secret, by the heads of its columns."""
     baseline, rows = metrics.baseline, []
-    for photos, own, plain, equal, size, plain_size, steps in zip(
+    for photos, quality, plain, equal, size, plain_size, steps in zip(
         metrics.photos,
         [metrics.cover, *metrics.secrets],
         [baseline.cover, *baseline.secrets],
@@ -74,13 +74,13 @@ def _scene_rows(metrics: HideMetrics) -> list[dict[str, str]]:
         metrics.steps,
         strict=True,
     ):
-        row = _quality(own) | {"Gaussians": f"{size:,}"}
+        row = _quality(quality) | {"Gaussians": f"{size:,}"}
         if plain_size not in (None, size):
             row["plain"] = f"{plain_size:,}"
         if photos and steps is not None:  # renders of a given model have no upper bound
             row["steps"] = f"{steps:,}"
         if photos and plain is not None and equal:
-            row |= {"bound": f"{plain.psnr:.2f}", "loss": f"{plain.psnr - own.psnr:z.2f}"}
+            row |= {"bound": f"{plain.psnr:.2f}", "loss": f"{plain.psnr - quality.psnr:z.2f}"}
         elif photos and plain is not None:
             row["start"] = f"{plain.psnr:.2f}"
         rows.append(row)
@@ -125,10 +125,10 @@ def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[st
     lines = ["PSNR in dB.", *(text for head, text in meanings.items() if head in heads)]
     if (wrong := metrics.wrong_key) is not None:
         pairs = zip(names[1:], wrong.vs_secrets, strict=True)
-        highest = ", ".join(f"{each.max:.2f} to the {name}" for name, each in pairs)
+        highest = ", ".join(f"{psnrs.max:.2f} to the {name}" for name, psnrs in pairs)
         cover = f"{wrong.vs_cover.mean:.2f} to the cover, at least {wrong.vs_cover.min:.2f}"
         lines.append(f"PSNR of {wrong.keys} wrong keys: on average {cover}; at most {highest}.")
-        chance = ", ".join(f"{each:.2f}" for each in metrics.chance_level)
+        chance = ", ".join(f"{psnr:.2f}" for psnr in metrics.chance_level)
         lines.append(
             f"Chance level: {chance}, the published model's PSNR to the secret: the limit for wrong keys."
         )
@@ -162,58 +162,62 @@ def print_fit(metrics: FitMetrics) -> None:
     print_table((*quality, "Gaussians", "iterations", "seconds"), [(*quality.values(), *sizes)], texts=0)
 
 
-def print_info(found: RunInfo | InterruptedRun | ModelInfo | SceneInfo) -> None:
+def print_info(described: RunInfo | InterruptedRun | ModelInfo | SceneInfo) -> None:
     """Print the description of `keyss info`."""
     from keyss.runs.describe import RunInfo
 
-    if not isinstance(found, RunInfo):
-        facts = {name: value for name, value in vars(found).items() if value is not None}
+    if not isinstance(described, RunInfo):
+        facts = {name: value for name, value in vars(described).items() if value is not None}
         capacity = facts.pop("capacity", ())
         rows = [(name.replace("_", " "), _text(value)) for name, value in facts.items()]
-        _print_columns([*rows, *(("capacity", each) for each in capacity)])
+        _print_columns([*rows, *(("capacity", line) for line in capacity)])
         return
     from keyss.runs.run_records import HideMetrics
 
-    metrics = found.metrics
+    metrics = described.metrics
     how = f" by the method {metrics.method}" if isinstance(metrics, HideMetrics) else ""
     # Without separators, a seed can be given to --seed.
-    print(f"{found.path}: {found.kind}{how}, made in {clock(metrics.seconds)} with --seed {metrics.seed}")
+    made = f"made in {clock(metrics.seconds)} with --seed {metrics.seed}"
+    print(f"{described.path}: {described.kind}{how}, {made}")
     if isinstance(metrics, HideMetrics):
         print_hiding(metrics)
     else:
         print_fit(metrics)
 
 
-def print_verification(found: Verification) -> None:
+def print_verification(checked: Verification) -> None:
     """Print the findings of `keyss verify`."""
-    model, rows = found.model, []
+    model, rows = checked.model, []
     problems = "; ".join(model.problems) or "sound"
-    for number, secret in enumerate(found.secrets, 1):
+    for number, secret in enumerate(checked.secrets, 1):
         of = f" of {secret.hidden:,}" if secret.hidden else ""
         what = f"{secret.found:,}{of} {secret.unit}: {'; '.join(secret.problems) or 'complete'}"
-        rows.append(("secret" if len(found.secrets) == 1 else f"secret of key {number}", what))
+        rows.append(("secret" if len(checked.secrets) == 1 else f"secret of key {number}", what))
     about_model = f"{model.gaussians:,} Gaussians of SH degree {model.sh_degree}: {problems}"
     _print_columns([("model", about_model), *(rows or [("secret", "not checked, as no key was given")])])
 
 
-def print_conversion(out: Path, found: Conversion, *, dry_run: bool) -> None:
+def print_conversion(out: Path, conversion: Conversion, *, dry_run: bool) -> None:
     """Print the cost of a conversion: size, PSNR of renders, and the parts of secrets that are left."""
     file = sys.stderr if is_standard(out) else sys.stdout
     if progress.level < 0 and not dry_run:
         print(out, file=file)
         return
-    was = "" if found.bytes_before is None else f", {_size(found.bytes_before)} before"
-    renders = "renders the same" if found.psnr >= 120 else f"renders at {found.psnr:.1f} dB PSNR"
-    if math.isnan(found.psnr):
+    was = "" if conversion.bytes_before is None else f", {_size(conversion.bytes_before)} before"
+    renders = "renders the same" if conversion.psnr >= 120 else f"renders at {conversion.psnr:.1f} dB PSNR"
+    if math.isnan(conversion.psnr):
         renders = "renders are empty: the model is invisible"
-    print(f"{out}: {len(found.gaussians):,} Gaussians, {_size(found.bytes_after)}{was}, {renders}", file=file)
+    print(
+        f"{out}: {len(conversion.gaussians):,} Gaussians, {_size(conversion.bytes_after)}{was}, {renders}",
+        file=file,
+    )
     if out.name.lower().endswith(".spz"):
         print("y is up in an .spz: programs that do not turn it show it upside down", file=file)
-    for number, secret in enumerate(found.secrets, 1):
-        which = "the secret" if len(found.secrets) == 1 else f"the secret of key {number}"
+    for number, secret in enumerate(conversion.secrets, 1):
+        which = "the secret" if len(conversion.secrets) == 1 else f"the secret of key {number}"
         state = "survives" if secret.kept else f"is lost: {secret.after:,} {secret.unit} are left"
         print(f"{which}, {secret.before:,} {secret.unit}, {state}", file=file)
-    if not found.secrets and not found.keeps_low_bits:
+    if not conversion.secrets and not conversion.keeps_low_bits:
         state = "would be" if dry_run else "are"
         print(f"secrets of --publish unchanged, if any, {state} lost; --key-file checks one", file=file)
     if dry_run:
@@ -231,11 +235,11 @@ def _size(count: int) -> str:
 
 def print_files(folder: Path, names: Mapping[str, str]) -> None:
     """Print paths and descriptions of the results that exist."""
-    found = [(str(folder / name), text) for name, text in names.items() if (folder / name).exists()]
+    results = [(str(folder / name), text) for name, text in names.items() if (folder / name).exists()]
     if progress.level < 0:
-        print(*(path for path, _ in found), sep="\n")
+        print(*(path for path, _ in results), sep="\n")
     else:
-        _print_columns(found)
+        _print_columns(results)
 
 
 def print_written(path: Path, text: str) -> None:

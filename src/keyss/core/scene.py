@@ -67,15 +67,6 @@ class ViewOptions:
     background: tuple[float, ...] | None = None  # [3] in [0, 1]
     skip_missing: bool = False  # skip photos that do not exist or have no usable camera
 
-    @staticmethod
-    def of(
-        width: int | None = None,
-        background: Tensor | Sequence[float] | None = None,
-        skip_missing: bool = False,
-    ) -> ViewOptions:
-        colour = None if background is None else tuple(float(each) for each in background)
-        return ViewOptions(width, colour, skip_missing)
-
 
 @dataclass(frozen=True)
 class Scene:

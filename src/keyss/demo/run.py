@@ -70,7 +70,7 @@ def run_demo(
             method=options.with_fit(seed=seed),
             bound=True,
             min_psnr=0,  # a quick demo writes its result, however poor
-            width=width,
+            views=keyss.ViewOptions(width),
             device=device,
             out=out,
             reporter=reporter,
@@ -153,5 +153,5 @@ def _comparison(
     }
     pictures = zip(*columns.values(), strict=True)
     return contact_sheet(
-        list(columns), {f"view {row}": each for row, each in zip(rows, pictures, strict=True)}
+        list(columns), {f"view {row}": images for row, images in zip(rows, pictures, strict=True)}
     )

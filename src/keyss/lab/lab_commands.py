@@ -22,8 +22,8 @@ from keyss.cli.arguments import (
     check_seed,
     optional,
     switch,
+    verb,
 )
-from keyss.cli.verbs import verb
 
 if TYPE_CHECKING:
     from keyss.lab.audits import Audit

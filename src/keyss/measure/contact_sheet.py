@@ -21,14 +21,17 @@ def contact_sheet(heads: Sequence[str], rows: Mapping[str, Sequence[Bytes]], cel
     gap, font = cell // 40, ImageFont.load_default(cell // 14)
     scaled = [
         [
-            Image.fromarray(each).resize((max(1, round(each.shape[1] * cell / each.shape[0])), cell))
-            for each in pictures
+            Image.fromarray(picture).resize((max(1, round(picture.shape[1] * cell / picture.shape[0])), cell))
+            for picture in pictures
         ]
         for pictures in rows.values()
     ]
     left = math.ceil(max(map(font.getlength, rows))) + 2 * gap
     widths = [
-        max(*(math.ceil(font.getlength(word)) for word in head.split()), *(each.width for each in pictures))
+        max(
+            *(math.ceil(font.getlength(word)) for word in head.split()),
+            *(picture.width for picture in pictures),
+        )
         for head, pictures in zip(heads, zip(*scaled, strict=True), strict=True)
     ]
     wrapped = [_wrapped(head, width, font) for head, width in zip(heads, widths, strict=True)]

@@ -88,14 +88,12 @@ def measure_hiding(
     opened: Sequence[HiddenScene],
     scenes: Sequence[Scene],  # the cover, then the secrets in the order of `opened`, each in its own frame
     shown: Sequence[Shown],  # of `compare`: the stego model, then the secrets
+    baseline: BaselineQuality,
     *,
-    gaussians: Sequence[int | None],  # these and the next: see `BaselineQuality`
-    steps: Sequence[int | None],
-    equal: Sequence[bool],
     wrong_keys: int = WRONG_KEYS,
     seed: int,
 ) -> HidingQuality:
-    """Measure cover and secrets, their plain models, and renders under wrong keys.
+    """Collect the quality of cover and secrets, and measure renders under wrong keys.
 
     Wrong keys are embeddings sampled like those of random keys. An attacker with a decoder but no key sees
     the models they decode to, which should look like the cover: PSNRs at the chance level. Raises UsageError
@@ -103,19 +101,12 @@ def measure_hiding(
     """
     if wrong_keys < 1:
         raise UsageError(f"expected at least one wrong key, got {wrong_keys}")
-    cover = scenes[0]
-    placed = [in_cover(*pair, cover) for pair in zip(opened, scenes[1:], strict=True)]
+    placed = [in_cover(*pair, scenes[0]) for pair in zip(opened, scenes[1:], strict=True)]
     return HidingQuality(
         cover=shown[0].quality,
-        secrets=tuple(secret.quality for secret in shown[1:]),
-        baseline=BaselineQuality(
-            shown[0].plain,
-            tuple(secret.plain for secret in shown[1:]),
-            tuple(gaussians),
-            tuple(steps),
-            tuple(equal),
-        ),
-        wrong_key=_wrong_keys(stego, opened, cover, placed, wrong_keys, seed),
+        secrets=tuple(render.quality for render in shown[1:]),
+        baseline=baseline,
+        wrong_key=_wrong_keys(stego, opened, scenes[0], placed, wrong_keys, seed),
         chance_level=tuple(_psnr(stego, scene) for scene in placed),
     )
 
@@ -143,11 +134,13 @@ def _wrong_keys(
 ) -> WrongKeys | None:
     """PSNRs of decoded models under wrong embeddings; None without decoders."""
     vs_cover, vs_secrets = [], []
-    for each, scene in zip(opened, secrets, strict=True):
-        if each.decode is None:
+    for secret, scene in zip(opened, secrets, strict=True):
+        if secret.decode is None:
             continue
-        embeddings = random_embeddings(count, torch.Generator().manual_seed(seed), each.key_size)
-        models = (each.decode(stego, embedding) for embedding in embeddings)  # one at a time: they are large
+        embeddings = random_embeddings(count, torch.Generator().manual_seed(seed), secret.key_size)
+        models = (
+            secret.decode(stego, embedding) for embedding in embeddings
+        )  # one at a time: they are large
         of_cover, of_secret = zip(
             *((_psnr(model, cover), _psnr(model, scene)) for model in models), strict=True
         )

@@ -33,6 +33,8 @@ from .method import (
     CommandLineOption as CommandLineOption,
     Context as Context,
     MethodOptions as MethodOptions,
+    Plan as Plan,
+    Prepared as Prepared,
     Source as Source,
     Stego as Stego,
     Training as Training,

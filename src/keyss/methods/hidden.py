@@ -91,20 +91,9 @@ class HiddenFile:
     def of(payload: Payload) -> HiddenFile:
         """Read a payload. Raises InputError for a scene and damage."""
         if payload.method != FILE:
-            raise InputError("this key opens a scene, not a file: give a model as output, e.g. secret.ply")
+            raise InputError("this key opens a scene, not a file")
         size = payload.data[0] if payload.data else 0
         name, data = payload.data[1 : 1 + size], payload.data[1 + size :]
         if not payload.data or len(name) < size:
             raise InputError("the hidden file is damaged: its name is cut off")
         return HiddenFile(name.decode(errors="replace"), data, payload.shards)
-
-
-class OpensAFileError(InputError):
-    """The key opens a hidden file where a scene was expected."""
-
-    def __init__(self, file: HiddenFile) -> None:
-        super().__init__(
-            f"this key opens a file of {len(file.data):,} bytes, not a scene: give the output a name that is "
-            "not a model's"
-        )
-        self.file = file

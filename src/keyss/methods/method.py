@@ -7,18 +7,21 @@ method's name, but for its capabilities.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeVar
 
 from keyss.channels.names import ConvertedChannel, Format, Publish
-from keyss.core.errors import UsageError
+from keyss.core.errors import KeyssWarning, UsageError
 from keyss.fitting.config import FitConfig, preset_for
 
 # Per Gaussian of the cover and of a secret (which ones are usable, encoding, error correction), and per key.
 _COVER_SECONDS, _SECRET_SECONDS, _KEY_SECONDS = 1e-5, 3e-5, 3.0
+_FALLBACK = 'cannot hide this undetectably: {}; falling back to `publish="converted"`, which inspection finds'
+T = TypeVar("T")
 
 if TYPE_CHECKING:  # the command line reads options without torch
     import torch
@@ -125,10 +128,12 @@ class MethodOptions:
     method: ClassVar[str]  # name in files and on the command line, 1 to 15 ASCII characters
 
     fit: FitConfig = field(default_factory=FitConfig)  # plain models, and joint training
-    publish: Publish = "unchanged"  # or "converted": the published model may be
-    format: Format | None = None  # for `publish="unchanged"`; None: the cover's format
-    # For `publish="converted"`: appended Gaussians have unlimited capacity but are visible in the file;
-    # colours are less visible but have little capacity.
+    # "unchanged": the published model must stay as it is; "converted": it may be converted. None: unchanged,
+    # but converted if the secrets cannot be hidden undetectably in the cover's format.
+    publish: Publish | None = None
+    format: Format | None = None  # of an unchanged model; None: the cover's
+    # Of a converted model: appended Gaussians hold any secret but are visible in the file; colours are less
+    # visible and hold little.
     channel: ConvertedChannel = "appended"
 
     def __post_init__(self) -> None:
@@ -138,35 +143,44 @@ class MethodOptions:
                 f'`channel="{self.channel}"` is for models that may be converted (`publish="converted"`)'
             )
         if self.format and self.publish == "converted":
-            raise UsageError(f'`format="{self.format}"` is for models that stay as they are: leave it out')
+            raise UsageError(f'`format="{self.format}"` is for models that stay unchanged: leave it out')
 
     @classmethod
     def preset(cls, size: str, device: str = "cpu") -> Self:
         """Options of one of the presets: see `keyss.fitting.config.preset_for`."""
         return cls(fit=preset_for(size, device))
 
-    def channel_in(self, cover: Gaussians | None = None) -> Channel:
-        """The channel that carries the secrets in `cover`; None: the cover is not known yet."""
-        from keyss.channels import channel_for
+    def in_channel(self, cover: Gaussians | None, use: Callable[[Channel], T]) -> T:
+        """The result of `use` with the channel that these options select for `cover` (None: not fitted yet).
 
-        return channel_for(self.publish, self.channel, self.format, cover)
+        If `use` raises UsageError, and neither `publish` nor `format` is given, falls back to appended
+        Gaussians with a KeyssWarning.
+        """
+        from keyss.channels import APPENDED, channel_for
 
-    @property
-    def trains(self) -> bool:
-        """True if hiding trains after the plain models are fitted; for prepared options."""
-        return any(training.steps for training in self.training(2))
+        channel = channel_for(self.publish or "unchanged", self.channel, self.format, cover)
+        try:
+            return use(channel)
+        except UsageError as refusal:
+            if channel.grows:
+                raise
+            if self.publish or self.format:
+                cure = '`channel="appended"`' if channel.survives else '`publish="converted"`'
+                raise UsageError(f"{refusal}; {cure} has room for any secret") from refusal
+            warnings.warn(_FALLBACK.format(refusal), KeyssWarning, stacklevel=2)
+        return use(APPENDED)
 
     @property
     def may_train(self) -> bool:
-        """True if hiding may train although models of all scenes are given; for options as given."""
-        return self.trains
+        """True if hiding may train even if models of all scenes are given."""
+        return any(training.steps for training in self.training(2))
 
     def fits(self, scenes: int) -> list[FitConfig]:
-        """The fits of the plain models of `scenes`, the cover first; for prepared options."""
+        """The fits of the plain models of `scenes`, the cover first."""
         return [self.fit] * scenes
 
     def training(self, scenes: int) -> tuple[Training, ...]:
-        """The method's own training of each of `scenes`, the cover first; for prepared options."""
+        """The method's own training of each of `scenes`, the cover first."""
         return (Training(),) * scenes
 
     @classmethod
@@ -181,7 +195,7 @@ class MethodOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What a method plans to publish, and how much of the secrets.
+    """The size of a published model and of its secrets.
 
     Sizes are exact for given models, and upper limits for models that are not fitted yet.
     """
@@ -198,6 +212,34 @@ class Plan:
         return 4e-6 * self.gaussians * (14 + 3 * (self.sh_degree + 1) ** 2)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Prepared:
+    """A hiding that a method has checked, with everything that is decided before training."""
+
+    options: Any  # as given; the method may complete `fit`
+    fits: tuple[FitConfig, ...]  # of the plain models, the cover first
+    training: tuple[Training, ...]  # the method's own, of each scene
+    plan: Plan
+    grows: bool = False  # the file grows with the secrets
+    survives: bool = False  # the secrets survive conversion to other formats
+    carrier: Any = None  # the method's own view of the cover, as large as the model
+
+    @staticmethod
+    def of(options: MethodOptions, scenes: int, plan: Plan) -> Prepared:
+        """Training as the options say, for a method that publishes an unchanged model."""
+        return Prepared(
+            options=options,
+            fits=tuple(options.fits(scenes)),
+            training=options.training(scenes),
+            plan=plan,
+        )
+
+    @property
+    def trains(self) -> bool:
+        """True if hiding trains after the plain models are fitted."""
+        return any(training.steps for training in self.training)
+
+
 class Method(Protocol):
     """One way to hide secrets."""
 
@@ -206,18 +248,15 @@ class Method(Protocol):
     capabilities: Capabilities
     options: type[MethodOptions]
 
-    def prepare(self, sources: Sequence[Source], options: Any) -> Any:
-        """Complete the options for these scenes, the cover first.
+    def prepare(self, sources: Sequence[Source], options: Any, earlier: Prepared | None = None) -> Prepared:
+        """Check that the scenes, the cover first, can be hidden, and decide how.
 
-        Called again with the plain models once they are fitted. Raises UsageError and InputError for what
-        cannot work, before any training.
+        Called again once missing plain models are fitted: the training and the channel of the `earlier` call
+        stay. Raises UsageError and InputError for what cannot work.
         """
 
-    def plan(self, sources: Sequence[Source], options: Any) -> Plan:
-        """The plan of a hiding; `options` are prepared."""
-
-    def hide(self, cover: Source, secrets: Sequence[Source], options: Any, context: Context) -> Stego:
-        """Hide the secrets; `options` are prepared and have a seed.
+    def hide(self, sources: Sequence[Source], prepared: Prepared, context: Context) -> Stego:
+        """Hide the secrets; all plain models are fitted, and the options have a seed.
 
         Raises KeyssError and its children, Interrupted.
         """

@@ -33,5 +33,7 @@ class PlacedScene:
     def all_of(sources: Sequence[Source]) -> list[PlacedScene]:
         """The cover, then the secrets, aligned with it by their cameras (ours; see `align`)."""
         cameras = [[view.camera for view in source.scene.train] for source in sources]
-        frames = [Similarity(), *(align(each, cameras[0]) for each in cameras[1:])]
-        return [PlacedScene.of(each.scene, each.model, at) for each, at in zip(sources, frames, strict=True)]
+        frames = [Similarity(), *(align(camera, cameras[0]) for camera in cameras[1:])]
+        return [
+            PlacedScene.of(source.scene, source.model, at) for source, at in zip(sources, frames, strict=True)
+        ]

@@ -12,7 +12,7 @@ from keyss.core.errors import InputError, UsageError
 if TYPE_CHECKING:
     from keyss.channels import Payload
     from keyss.core.gaussians import Gaussians
-    from keyss.methods.hidden import HiddenScene
+    from keyss.methods.hidden import HiddenFile, HiddenScene
     from keyss.methods.method import Method, MethodOptions
 
 
@@ -93,29 +93,37 @@ def of_options(options: MethodOptions) -> Method:
     return get(name)
 
 
-def open_model(stego: Gaussians, key: str) -> HiddenScene:
+def open_secret(stego: Gaussians, key: str) -> HiddenScene | HiddenFile:
     """The secret that `key` opens in a model (see `keyss.channels.publishing`).
 
     Raises WrongKeyError for a key that opens nothing, InputError for damage.
     """
     from keyss.channels import open_payload
+    from keyss.methods.hidden import FILE, HiddenFile
 
-    return _unpack(open_payload(stego, key))
+    payload = open_payload(stego, key)
+    return HiddenFile.of(payload) if payload.method == FILE else _scene_of(payload)
+
+
+def open_model(stego: Gaussians, key: str) -> HiddenScene:
+    """The scene that `key` opens in a model; see `open_secret`. Raises InputError for a file."""
+    from keyss.methods.hidden import HiddenFile
+
+    secret = open_secret(stego, key)
+    if isinstance(secret, HiddenFile):
+        raise InputError(f"this key opens a file of {len(secret.data):,} bytes, not a scene")
+    return secret
 
 
 def open_companion(data: bytes) -> HiddenScene:
     """The secret in a companion file (see `keyss.methods.companion`). Raises InputError."""
     from keyss.methods import companion
 
-    return _unpack(companion.unpack(data))
+    return _scene_of(companion.unpack(data))
 
 
-def _unpack(payload: Payload) -> HiddenScene:
-    from keyss.methods.hidden import FILE, HiddenFile, OpensAFileError
-
+def _scene_of(payload: Payload) -> HiddenScene:
     name = payload.method
-    if name == FILE:
-        raise OpensAFileError(HiddenFile.of(payload))
     if name not in METHODS:
         raise InputError(
             f"the secret was hidden by the method {name!r}; this program has {', '.join(METHODS)}"

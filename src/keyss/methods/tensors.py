@@ -50,11 +50,11 @@ def unpack_tensors(
     size = int.from_bytes(data[:8], "little")
     outer = msgspec.json.decode(data[8 : 8 + size], type=dict[str, msgspec.Raw])
     text = msgspec.json.decode(outer["__metadata__"], type=dict[str, str])[_ENTRY].encode()
-    found = msgspec.json.decode(text, type=Header)
-    if found.format != format:
-        raise ValueError(f"format {found.format[:40]!r}")
-    if found.version != version:
-        raise InputError(f"secret of version {found.version}; this program reads version {version}")
+    declared = msgspec.json.decode(text, type=Header)
+    if declared.format != format:
+        raise ValueError(f"format {declared.format[:40]!r}")
+    if declared.version != version:
+        raise InputError(f"secret of version {declared.version}; this program reads version {version}")
     # msgspec needs the hook for the tensors of a `Similarity`.
     header = msgspec.json.decode(
         text, type=kind, dec_hook=lambda _, numbers: torch.tensor(numbers, dtype=torch.float64)

@@ -1,6 +1,6 @@
 """The verb `info`: descriptions of files and folders.
 
-Imports for a plain .ply neither torch nor what only folders need, which takes a second.
+For a plain .ply, imports neither torch nor the modules for folders, which would take a second.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def _folder_info(path: Path) -> RunInfo | InterruptedRun | ModelInfo | SceneInfo
         if inside == path / MODEL:
             return RunInfo("plain model", str(path), read_record(path / METRICS, FitMetrics))
         return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))
-    if runs := sorted(each for each in path.iterdir() if is_run(each)):
+    if runs := sorted(folder for folder in path.iterdir() if is_run(folder)):
         raise InputError(f"{path} is not a run, but a folder of {len(runs)}: name one, such as {runs[0]}")
     scene = load_scene(path, skip_missing=True)
     sizes = Counter(f"{view.camera.width} x {view.camera.height}" for view in scene.views)
@@ -131,7 +131,7 @@ def _steps_done(run: Path) -> int:
     from keyss.fitting.loop import load_checkpoint
     from keyss.runs.folder import CHECKPOINTS
 
-    files = sorted((run / CHECKPOINTS).glob("*.safetensors"), key=lambda each: each.stat().st_mtime)
+    files = sorted((run / CHECKPOINTS).glob("*.safetensors"), key=lambda file: file.stat().st_mtime)
     try:
         return int(load_checkpoint(files[-1])[1]["iteration"]) if files else 0
     except InputError:
@@ -139,7 +139,7 @@ def _steps_done(run: Path) -> int:
 
 
 def _model_info(path: Path, capacity: bool = False) -> ModelInfo:
-    found = None
+    capacities = None
     if (summary := None if capacity else summarise_ply(path)) is not None:
         count, degree, transparent = summary.gaussians, summary.sh_degree, summary.nearly_transparent
         low, high = _round(summary.low), _round(summary.high)
@@ -148,7 +148,7 @@ def _model_info(path: Path, capacity: bool = False) -> ModelInfo:
         count, degree = len(model), model.sh_degree
         low, high = _round(model.means.amin(0)), _round(model.means.amax(0))
         transparent = int((model.opacity_logits < NEARLY_TRANSPARENT).sum())
-        found = tuple(_capacities(model)) if capacity else None
+        capacities = tuple(_capacities(model)) if capacity else None
     return ModelInfo(
         kind="3DGS model",
         path=str(path),
@@ -157,7 +157,7 @@ def _model_info(path: Path, capacity: bool = False) -> ModelInfo:
         sh_degree=degree,
         bounding_box=(low, high),
         nearly_transparent=round(transparent / count, 4),
-        capacity=found,
+        capacity=capacities,
     )
 
 
@@ -177,16 +177,16 @@ def _capacities(model: Gaussians) -> Iterator[str]:
     from keyss.channels import channel_for
 
     ways: list[tuple[str, Any]] = [
-        *((f"--format {each}", ("unchanged", "appended", each)) for each in get_args(Format)),
+        *((f"--format {name}", ("unchanged", "appended", name)) for name in get_args(Format)),
         ("--publish converted --channel colours", ("converted", "colours", None)),
     ]
     for flags, (publish, channel, format) in ways:
         try:
-            found = channel_for(publish, channel, format, model).prepare(model).capacity
+            room = channel_for(publish, channel, format, model).prepare(model).capacity
         except UsageError as error:
             yield f"{flags}: nothing ({error})"
             continue
-        size = max(0, found.bytes - found.overhead)
+        size = max(0, room.bytes - room.overhead)
         yield f"{flags}: {size:,} bytes, a model of about {size // _BYTES_PER_GAUSSIAN:,} Gaussians"
     yield "--publish converted: any secret, as the file grows"
 

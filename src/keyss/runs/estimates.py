@@ -1,4 +1,4 @@
-"""Rough times of work on files of models, for the line that says how long it takes.
+"""Rough times of reading and writing models, for progress lines.
 
 Does not import torch.
 """
@@ -41,13 +41,13 @@ def seconds_for(task: str, model: Path) -> float:
 
 def seconds_to_convert(model: Path, out: Path, keys: int) -> float:
     """About the seconds to convert a model and to open its secrets before and after."""
-    suffix = next((each for each in _SECONDS if each.startswith(".") and out.name.endswith(each)), ".ply")
+    suffix = next((name for name in _SECONDS if name.startswith(".") and out.name.endswith(name)), ".ply")
     return seconds_for(suffix, model) + 2 * keys * (seconds_for("reveal", model) - _START)
 
 
 def seconds_to_prepare(sources: Sequence[object]) -> float:
     """About the seconds to read models and to find what can be written in them; photos do not count."""
-    paths = [Path(each) for each in sources if isinstance(each, str | Path)]
+    paths = [Path(source) for source in sources if isinstance(source, str | Path)]
     count = sum(gaussians_in(path) for path in paths if path.is_file())
     return _START + _SECONDS["prepare"] * count / 1e6
 

@@ -1,12 +1,9 @@
-"""Names of the files in a folder of results, and arguments that stand for models and scenes."""
+"""File names in a run's folder; models and scenes that are given as arguments."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
-
-from torch import Tensor
 
 from keyss.channels import SUFFIXES, suffix_of
 from keyss.core.errors import InputError, UsageError
@@ -26,7 +23,6 @@ LOOK = f"{PRIVATE}/look.png"  # test views before and after
 COMPANIONS = f"{PRIVATE}/companion"  # companion files, for those who may see a secret
 CONTROLS = f"{PRIVATE}/controls"  # plain models of the cover from other seeds, for audits
 PathLike = str | Path
-Background = Tensor | Sequence[float] | None
 
 
 def is_run(folder: Path) -> bool:
@@ -62,12 +58,12 @@ def run_folder(path: Path) -> Path:
         (path / CONFIG).stat()
         if not os.path.isfile(path / MODEL):
             return path
-        found = "one that `keyss fit` wrote"
+        problem = "one that `keyss fit` wrote"
     except OSError as error:
         run = next((parent for parent in path.absolute().parents[:2] if is_run(parent)), None)
-        found = f"{kind} in one; give {run}" if run else f"no {CONFIG} in it ({error.strerror})"
+        problem = f"{kind} in one; give {run}" if run else f"no {CONFIG} in it ({error.strerror})"
     raise InputError(
-        f"{path}: expected the folder of a run, as `keyss hide --secret` writes it, found {found}"
+        f"{path}: expected the folder of a run, as `keyss hide --secret` writes it, found {problem}"
     )
 
 

@@ -17,7 +17,7 @@ from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Targets
 from keyss.kernels.memory import available_memory
-from keyss.methods.method import MethodOptions, Source, seconds_to_hide
+from keyss.methods.method import MethodOptions, Plan, Prepared, Source, seconds_to_hide
 from keyss.methods.plain_models import Bound
 from keyss.progress import about
 
@@ -56,48 +56,49 @@ class Cost:
         )
 
 
-def cost_of_fit(scene: Scene, config: FitConfig, device: torch.device) -> Cost:
+def cost_of_fit(scene: Scene, fit: FitConfig, device: torch.device) -> Cost:
     """The cost of a plain fit, which is a hiding without secrets."""
-    return cost_of(MethodOptions(fit=config), [Source(None, photos=True, loaded=scene)], device)
+    plan = Plan(gaussians=fit.max_gaussians, sh_degree=fit.sh_degree, secret_gaussians=0, capacity=0)
+    prepared = Prepared.of(MethodOptions(fit=fit), 1, plan)
+    return cost_of(prepared, [Source(None, photos=True, loaded=scene)], device)
 
 
 def cost_of(
-    options: MethodOptions,  # prepared
+    prepared: Prepared,
     sources: Sequence[Source],  # the cover, then the secrets, loaded at least with their test images
     device: torch.device,
     *,
     bound: bool = False,  # also fit the upper bounds
 ) -> Cost:
     """The cost of a hiding."""
-    count, most = len(sources), options.fit.max_gaussians
-    fits, trainings = options.fits(count), options.training(count)
-    steps, trained, sizes = max(training.steps for training in trainings), 0, []
+    fit = prepared.options.fit
+    steps, trained, sizes = max(training.steps for training in prepared.training), 0, []
     seconds, check_seconds, fit_seconds, views = 0.0, 0.0, [], []
-    for source, fit, training in zip(sources, fits, trainings, strict=True):
-        size = most if source.given is None or not training.continues else len(source.given)
-        own = fit.iterations if source.given is None else 0
-        renders = own + training.steps * training.step_cost
-        longer = Bound.of(training, own or None)
+    for source, plain, training in zip(sources, prepared.fits, prepared.training, strict=True):
+        known = source.given if training.continues else None
+        size = fit.max_gaussians if known is None else len(known)
+        plain_steps = plain.iterations if source.given is None else 0
+        renders = plain_steps + training.steps * training.step_cost
+        longer = Bound.of(training, plain_steps or None)
         if bound and source.photos and not longer.equal:
             renders += longer.steps or 0
         step = step_seconds(device.type, size, _pixels(source.scene))
         seconds += renders * step
         views.append(view_seconds(device.type, size, source.scene))
         check_seconds += len(source.scene.test) * views[-1] + _READ_SECONDS * size
-        fit_seconds.append(own * step)
-        steps += own
-        trained += size if own or training.steps else 0
+        fit_seconds.append(plain_steps * step)
+        steps += plain_steps
+        trained += size if plain_steps or training.steps else 0
         sizes.append(size)
     seconds += seconds_to_hide(sizes[0], sizes[1:]) + check_seconds
-    appended = _MAX_APPENDED * sum(sizes[1:]) if options.channel_in().grows else 0
+    appended = _MAX_APPENDED * sum(sizes[1:]) if prepared.grows else 0
     published = sizes[0] + appended
-    degree = max(options.fit.sh_degree if each.given is None else each.given.sh_degree for each in sources)
+    degree = max(fit.sh_degree if source.given is None else source.given.sh_degree for source in sources)
     gaussian = 4 * (14 + 3 * (degree + 1) ** 2)  # bytes in a .ply, with normals
     resident: int = psutil.Process().memory_info().rss
-    largest = max(published, *sizes) * gaussian
     memory = resident + (_COPIES * (published + sum(sizes[1:])) + _SHARDS * appended) * gaussian
     if trained:  # gradients, moments and two checkpoints
-        memory += (1 + _CHECKPOINTS) * largest
+        memory += (1 + _CHECKPOINTS) * max(published, *sizes) * gaussian
         memory += max(Targets.max_bytes(source.scene.train) for source in sources)
     disk = (published + sum(sizes) + _CHECKPOINTS * trained) * gaussian + _OTHER_BYTES
     return Cost(steps, seconds, tuple(fit_seconds), check_seconds, sum(views), device.type, disk, memory)
@@ -122,7 +123,7 @@ def check_room(cost: Cost, out: Path | None) -> None:
     """Raise OutputError if the disk of `out` lacks space for all files; warn if memory is short."""
     if out is not None:
         real = Path(os.path.realpath(out))  # need not exist
-        free = shutil.disk_usage(next(each for each in (real, *real.parents) if each.exists())).free
+        free = shutil.disk_usage(next(folder for folder in (real, *real.parents) if folder.exists())).free
         if free < cost.disk_bytes:
             raise OutputError(
                 f"{out}: expected {cost.disk_bytes / 1e6:,.0f} MB of free space for models and checkpoints, "

@@ -1,4 +1,4 @@
-"""Reveal the secret of a key in a published model, and check both: soundness, and the share that is left."""
+"""Open a secret; check the model and how much of the secret survived."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.files.inputs import read_file
 from keyss.methods import companion as companions, registry
-from keyss.methods.hidden import Frame, HiddenFile, HiddenScene, OpensAFileError, Recovered
+from keyss.methods.hidden import Frame, HiddenFile, HiddenScene, Recovered
 from keyss.runs.files import PathLike
 
 MIN_LEFT = 0.1  # share; pruning compensation stops there, and renders become empty
@@ -38,12 +38,12 @@ class Revealed:
     def gaussians(self) -> Gaussians:
         """The model of the scene. Raises UsageError if the key opens a file."""
         if self.scene is None:
-            raise UsageError("this key opens a file, not a scene: see `file`")
+            raise UsageError("this key opens a file, not a scene: see `Revealed.file`")
         return self.scene
 
     def check_usable(self) -> None:
         """Raise InputError if so little is left that renders would be nearly empty."""
-        if self.recovered.share < MIN_LEFT:
+        if self.file is None and self.recovered.share < MIN_LEFT:
             raise InputError(
                 f"{_count(self.recovered)}, too few to render (expected at least {MIN_LEFT:.0%}): the others "
                 f"{_CAUSE}; use the file as it was published, or `force=True` to get the rest"
@@ -56,41 +56,32 @@ _CAUSE = (
 )
 
 
-def reveal_model(
+def reveal_secret(
     model: Gaussians,
     key: str | None,
-    *,
     device: torch.device,
+    *,
     frame: Frame = "secret",
     force: bool = False,
     companion: PathLike | None = None,
 ) -> Revealed:
     """The secret that `key` opens in a stego model, however little is left; raises as `keyss.reveal` does."""
-    if companion is not None:
-        if key is not None:
-            raise UsageError("companion files have no keys: whoever has one sees the secret")
-        opened = read_companion(companion)
-    elif key is None:
+    if companion is None and key is None:
         raise UsageError("expected `key`, or `companion` for a companion file")
-    else:
-        opened = registry.open_model(model, key)
-    revealed = opened.reveal(model.to(device), frame=frame, force=force)
-    recovered = opened.recovered(revealed)
+    if companion is not None and key is not None:
+        raise UsageError("companion files have no keys: whoever has one sees the secret")
+    secret = registry.open_secret(model, key) if key is not None else read_companion(companion or "")
+    if isinstance(secret, HiddenFile):
+        if force or frame != "secret":
+            raise UsageError(
+                f"this key opens a file, {secret.name!r}: `force` and `frame` are for scenes, leave them out"
+            )
+        size = len(secret.data)
+        recovered = Recovered(size, size, secret.shards)
+        return Revealed(None, recovered, tuple(loss_warnings(recovered)) if size else (), secret)
+    revealed = secret.reveal(model.to(device), frame=frame, force=force)
+    recovered = secret.recovered(revealed)
     return Revealed(revealed, recovered, tuple(loss_warnings(recovered)))
-
-
-def reveal_any(model: Gaussians, key: str, device: torch.device) -> Revealed:
-    """The scene, however little is left, or the file that `key` opens in a model."""
-    try:
-        return reveal_model(model, key, device=device)
-    except OpensAFileError as error:
-        return revealed_file(error.file)
-
-
-def revealed_file(file: HiddenFile) -> Revealed:
-    """The result for a hidden file, which is always complete."""
-    recovered = Recovered(len(file.data), len(file.data), file.shards)
-    return Revealed(None, recovered, tuple(loss_warnings(recovered)) if file.data else (), file)
 
 
 def loss_warnings(recovered: Recovered) -> list[str]:

@@ -8,7 +8,7 @@ import re
 import pytest
 
 from channels.lsb.trained_like import trained_like
-from keyss import Secret, SecretFile, hide, hide_files
+from keyss import CarryOptions, Secret, SecretFile, hide
 from keyss.channels import channel_for
 from keyss.channels.appended import appended_channel
 from keyss.channels.lsb import usable
@@ -37,7 +37,7 @@ def test_large_covers_without_random_bits_are_refused_by_a_sample(monkeypatch: p
     assert judged == [1000]
 
 
-@pytest.mark.parametrize(("publish", "channel"), [("converted", "colours"), ("unchanged", "colours")])
+@pytest.mark.parametrize(("publish", "channel"), [("converted", "colours"), ("unchanged", "appended")])
 def test_files_that_no_cover_of_the_size_holds_are_refused_unseen(
     monkeypatch: pytest.MonkeyPatch, publish: str, channel: str
 ) -> None:
@@ -45,10 +45,11 @@ def test_files_that_no_cover_of_the_size_holds_are_refused_unseen(
     place = channel_for(publish, channel, None, cover)  # type: ignore[arg-type]
     monkeypatch.setattr(type(place), "prepare", lambda *_: pytest.fail("the cover is examined"))
     secret = SecretFile(os.urandom(4_000_000), "7Vw3-Qp: a key for a test", "noise")
+    options = CarryOptions(publish=publish, channel=channel)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="of a cover of 20,000 Gaussians hold about"):
-        hide_files(cover, [secret], publish=publish)  # type: ignore[arg-type]
+        hide(cover, [secret], method=options)
     with pytest.raises(pytest.fail.Exception, match="the cover is examined"):  # its zeros compress
-        hide_files(cover, [SecretFile(bytes(1_000_000), secret.key, "zeros")], publish=publish)  # type: ignore[arg-type]
+        hide(cover, [SecretFile(bytes(1_000_000), secret.key, "zeros")], method=options)
 
 
 def test_secrets_that_cannot_be_appended_are_refused_by_a_sample(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,4 +72,4 @@ def test_secrets_that_cannot_be_appended_are_refused_by_a_sample(monkeypatch: py
     (told,) = re.findall(r"about ([0-9,]+) bytes", str(refused.value))
     assert 0.8 * exact < int(told.replace(",", "")) < 1.2 * exact
     monkeypatch.setattr(appended_channel, "MAX_BYTES", exact)
-    capacity.SecretSize.of(secret).check_appended()  # may fit
+    capacity.check_appended(secret)  # may fit

@@ -167,18 +167,6 @@ def test_harmonics_of_one_colour_that_agree_three_times_stay_as_they_are() -> No
     assert usable[100:].mean() > 0.94
 
 
-def test_a_cover_that_was_changed_in_place_is_looked_at_again() -> None:
-    """What was found is kept as long as the cover is as it was."""
-    cover = trained_like(1000)
-    before = LOW_BITS.prepare(cover)
-    assert LOW_BITS.prepare(cover).carriers is before.carriers
-    assert before.carriers.usable[4][:10].any()
-    cover.log_scales[:10] = 0.5
-    after = LOW_BITS.prepare(cover)
-    assert not after.carriers.usable[4][:10].any()
-    assert (after.carriers.ids[:10] != before.carriers.ids[:10]).any()
-
-
 def test_saturated_opacities_stay_as_they_are() -> None:
     """Logits whose sigmoid has no gradient stay equal in clones whose other numbers were trained."""
     model = trained_like(2000, 3)

@@ -45,7 +45,7 @@ def audited_run(root: Path) -> None:
             scenes[0],
             secrets,
             method=JOINT.with_fit(max_gaussians=1300, iterations=20, seed=0),
-            width=40,
+            views=keyss.ViewOptions(40),
             cover_model=random_gaussians(1000, seed=0),
             min_psnr=0,  # 20 steps from points
             out=root / "run",

@@ -10,20 +10,19 @@ import pytest
 import torch
 
 from channels.lsb.trained_like import trained_like
-from keyss import CarryOptions, Gaussians
-from keyss.channels import Layout, LowBitsCapacity
+from keyss import CarryOptions, FitConfig, Gaussians
+from keyss.channels import LOW_BITS, Layout, LowBitsCapacity
 from keyss.core import KeyssWarning, UsageError
 from keyss.keys.encryption import OVERHEAD, compressed_size
-from keyss.methods import Context, Source, registry
+from keyss.methods import Context, Prepared, Source, registry
 from keyss.methods.carry.capacity import CarryCapacity, shares
 from keyss.rendering import Viewpoints, scene_of_model
 
 KEY = "a key of many characters: 93hXmQ2"
 
 
-def _prepare(options: CarryOptions, *models: Gaussians) -> CarryOptions:
-    found: CarryOptions = registry.get("carry").prepare([Source(each, False) for each in models], options)
-    return found
+def _prepare(options: CarryOptions, *models: Gaussians) -> Prepared:
+    return registry.get("carry").prepare([Source(model, False) for model in models], options)
 
 
 def _unit(model: Gaussians) -> Gaussians:
@@ -34,14 +33,13 @@ def _unit(model: Gaussians) -> Gaussians:
 def test_cover_without_harmonics(change: Callable[[Gaussians], Gaussians], least: int) -> None:
     """A secret is pruned to what the low bits of geometry hold."""
     cover, secret = change(trained_like(20_000, sh_degree=0)), trained_like(4000, 1, 2)
-    options = _prepare(CarryOptions(fine_tune="never", format="ply"), cover, secret)
-    sources = [Source(each, False, KEY, scene_of_model(each, "m", size=24)) for each in (cover, secret)]
-    planned = registry.get("carry").plan(sources, options)
+    prepared = _prepare(CarryOptions(fine_tune="never", format="ply"), cover, secret)
+    sources = [Source(model, False, KEY, scene_of_model(model, "m", size=24)) for model in (cover, secret)]
     context = Context(torch.device("cpu"), entropy=bytes(32))
-    stego = registry.get("carry").hide(sources[0], sources[1:], options, context)
+    stego = registry.get("carry").hide(sources, prepared, context)
     (opened,) = stego.opened
-    assert stego.gaussians.sh_degree == planned.sh_degree == 0
-    assert len(opened.reveal(stego.gaussians)) >= planned.capacity > least
+    assert stego.gaussians.sh_degree == prepared.plan.sh_degree == 0
+    assert len(opened.reveal(stego.gaussians)) >= prepared.plan.capacity > least
 
 
 def test_predictable_cover_is_refused() -> None:
@@ -54,10 +52,11 @@ def test_predictable_cover_is_refused() -> None:
         model.opacity_logits,
         model.sh[:, :, :1].repeat(1, 1, 3),
     )
-    with pytest.raises(UsageError, match=r"random low bits.*`publish=.converted.`"):
-        _prepare(CarryOptions(format="ply"), grey, grey)
-    with pytest.warns(KeyssWarning, match=r"whoever inspects.*random low bits"):
-        assert _prepare(CarryOptions(), grey, grey).publish == "converted"
+    for explicit in (CarryOptions(format="ply"), CarryOptions(publish="unchanged")):
+        with pytest.raises(UsageError, match=r"random low bits.*`publish=.converted.`"):
+            _prepare(explicit, grey, grey)
+    with pytest.warns(KeyssWarning, match=r"undetectably.*random low bits"):
+        assert _prepare(CarryOptions(), grey, grey).survives
     _prepare(CarryOptions(), trained_like(8000), grey)
     _prepare(CarryOptions(publish="converted"), grey, grey)
 
@@ -75,10 +74,10 @@ def test_shares_fit(gaussians: int, secrets: int) -> None:
             cells.plan([compressed_size(random.bytes(limit)) + OVERHEAD for limit in limits])
 
 
-def test_a_secret_that_is_pruned_for_others_is_not_hidden_silently() -> None:
+def test_pruning_for_other_secrets_warns() -> None:
     """Alone it would stay whole; pruned to a third, its payload fits into a half."""
     cover, models = trained_like(4000), [trained_like(count, 1, 1) for count in (4000, 200, 200)]
-    capacity = CarryCapacity.of(cover, CarryOptions(format="ply"))
+    capacity = CarryCapacity.of(LOW_BITS, cover, FitConfig())
     views = [Viewpoints.around(model) for model in models]
     (alone,) = capacity.prune(models[:1], views[:1])
     assert len(alone) == 4000

@@ -13,7 +13,7 @@ from channels.lsb.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.channels import gaussian_ids
 from keyss.core import Gaussians, KeyssWarning, Scene
-from keyss.methods import Source, Training, most_contributing, registry
+from keyss.methods import Prepared, Source, Training, most_contributing, registry
 from methods.hiding import check_resumes, hide_scenes, psnr_in, three_scenes
 from tiny_scenes import random_gaussians, tiny_scene
 
@@ -24,9 +24,13 @@ KEYS = ("first key", "second key")
 PHOTOS = Source(None, photos=True)
 
 
-def _prepare(options: CarryOptions, *sources: Source) -> CarryOptions:
-    found: CarryOptions = registry.get("carry").prepare(sources, options)
-    return found
+def _prepare(options: CarryOptions, *sources: Source) -> Prepared:
+    return registry.get("carry").prepare(sources, options)
+
+
+def _steps(options: CarryOptions, *sources: Source) -> list[int]:
+    """Steps of fine-tuning of each secret."""
+    return [training.steps for training in _prepare(options, *sources).training[1:]]
 
 
 def _source(model: Gaussians, photos: bool = False) -> Source:
@@ -35,10 +39,10 @@ def _source(model: Gaussians, photos: bool = False) -> Source:
 
 def test_no_fine_tuning_when_secret_fits() -> None:
     cover, secret = trained_like(2500), trained_like(900, 1, 2)
-    found = _prepare(CarryOptions(), _source(cover), _source(secret))
-    assert found.fine_tuning_steps == (0,)
-    assert not found.trains
-    result = keyss.hide(cover, [Secret(secret, KEY)], width=24)
+    prepared = _prepare(CarryOptions(), _source(cover), _source(secret))
+    assert prepared.training == (Training(), Training())
+    assert not prepared.trains
+    result = keyss.hide(cover, [Secret(secret, KEY)], views=keyss.ViewOptions(24))
     assert result.metrics.iterations == 0
     revealed = keyss.reveal(result.stego, KEY).gaussians
     assert (len(revealed), revealed.sh_degree) == (900, 2)
@@ -47,40 +51,45 @@ def test_no_fine_tuning_when_secret_fits() -> None:
 def test_fine_tuning_steps() -> None:
     cover, small, large = trained_like(2500), trained_like(300, 1), trained_like(6000, 2)
     options = CarryOptions(fit=FIT)
-    assert _prepare(options, _source(cover), _source(large)).fine_tuning_steps == (400,)
-    assert _prepare(options, _source(cover), _source(large, photos=True)).fine_tuning_steps == (1150,)
-    assert _prepare(options, _source(cover), _source(small), _source(large)).fine_tuning_steps == (0, 400)
+    assert _steps(options, _source(cover), _source(large)) == [400]
+    assert _steps(options, _source(cover), _source(large, photos=True)) == [1150]
+    assert _steps(options, _source(cover), _source(small), _source(large)) == [0, 400]
     asked = options.with_fit(iterations=900)
-    assert _prepare(asked, _source(cover), _source(large)).fine_tuning_steps == (900,)
+    assert _steps(asked, _source(cover), _source(large)) == [900]
     result = keyss.hide(
-        cover, [Secret(large, KEY)], method=options.with_fit(iterations=2), width=24, min_psnr=0
+        cover,
+        [Secret(large, KEY)],
+        method=options.with_fit(iterations=2),
+        views=keyss.ViewOptions(24),
+        min_psnr=0,
     )
     assert result.metrics.iterations == 2
     assert (len(keyss.reveal(result.stego, KEY).gaussians),) == result.metrics.secret_gaussians
 
 
-def test_secrets_that_share_the_capacity_are_noticed() -> None:
+def test_shared_capacity_warns() -> None:
     cover, large = trained_like(2500), [trained_like(2000, seed) for seed in (1, 2)]
     secrets = [Secret(model, f"{KEY} {number}") for number, model in enumerate(large)]
     with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):
-        keyss.hide(cover, secrets, method=CarryOptions(fine_tune="never"), width=24, min_psnr=0)
+        keyss.hide(
+            cover, secrets, method=CarryOptions(fine_tune="never"), views=keyss.ViewOptions(24), min_psnr=0
+        )
 
 
 def test_fine_tuning_option() -> None:
     cover, secret, large = trained_like(2500), trained_like(900, 1), trained_like(6000, 2)
     always, never = CarryOptions(fine_tune="always"), CarryOptions(fine_tune="never")
-    assert _prepare(always, _source(cover), _source(secret)).fine_tuning_steps == (400,)
-    assert _prepare(never, _source(cover), _source(secret)).fine_tuning_steps == (0,)
-    assert _prepare(never, _source(cover), _source(large)).fine_tuning_steps == (0,)
+    assert _steps(always, _source(cover), _source(secret)) == [400]
+    assert _steps(never, _source(cover), _source(secret)) == [0]
+    assert _steps(never, _source(cover), _source(large)) == [0]
 
 
 @pytest.mark.parametrize(("format", "secrets"), [("ply", 3), ("spz", 1)])
 def test_fine_tuning_from_photos(format: str, secrets: int) -> None:
     options = CarryOptions(fit=FIT, format=format)  # type: ignore[arg-type]
-    found = _prepare(options, *[PHOTOS] * (1 + secrets))
-    assert found.fine_tuning_steps == (1150,) * secrets
-    assert [each.iterations for each in found.fits(1 + secrets)] == [1000] * (1 + secrets)
-    assert found.training(1 + secrets) == (Training(), *[Training(1150)] * secrets)
+    prepared = _prepare(options, *[PHOTOS] * (1 + secrets))
+    assert [fit.iterations for fit in prepared.fits] == [1000] * (1 + secrets)
+    assert prepared.training == (Training(), *[Training(1150)] * secrets)
 
 
 def test_most_contributing() -> None:

@@ -92,7 +92,7 @@ def test_secret_from_photos(tmp_path: Path) -> None:
         trained_like(1500),
         [Secret(tiny_scene(1), KEY)],
         method=options,
-        width=48,
+        views=keyss.ViewOptions(48),
         out=tmp_path / "run",
     )
     assert (tmp_path / "run/private/secret-1.ply").exists()
@@ -114,7 +114,7 @@ def test_hide_in_cover_of_few_steps(steps: int, views: int) -> None:
     cover = replace(scene, points=points, colors=(255 * points.sigmoid()).to(torch.uint8))
     options = CarryOptions(fit=FitConfig(iterations=steps, max_gaussians=1500, evaluate_every=0, seed=0))
     secret = Secret(random_gaussians(300), KEY)
-    result = keyss.hide(cover, [secret], method=options, width=24)
+    result = keyss.hide(cover, [secret], method=options, views=keyss.ViewOptions(24))
     assert result.metrics.secret_gaussians == (300,)
     assert result.metrics.against_plain[0].psnr > 40
 

@@ -22,14 +22,14 @@ def test_hide_reveal_verify_and_info(format: str, tmp_path: Path) -> None:
     cover, secrets = model_of(4000), [model_of(100, seed) for seed in (1, 2)]
     options = CarryOptions(format=format)  # type: ignore[arg-type]
     asked = [keyss.Secret(model, f"key number {i}") for i, model in enumerate(secrets)]
-    keyss.hide(cover, asked, method=options, width=32, min_psnr=0, out=tmp_path / "run")
+    keyss.hide(cover, asked, method=options, views=keyss.ViewOptions(32), min_psnr=0, out=tmp_path / "run")
     (stego,) = (tmp_path / "run" / "publish").iterdir()
     assert stego.name == f"model{SUFFIXES[format]}"
     for index, secret in enumerate(secrets):
-        found = keyss.reveal(stego, f"key number {index}").gaussians
-        assert len(found) == 100
+        revealed = keyss.reveal(stego, f"key number {index}").gaussians
+        assert len(revealed) == 100
         # Packing sorts them.
-        nearest = torch.cdist(found.means, secret.means).min(dim=1).values
+        nearest = torch.cdist(revealed.means, secret.means).min(dim=1).values
         assert float(nearest.max()) < 0.01
         assert keyss.verify(stego, f"key number {index}").secrets
     with pytest.raises(keyss.WrongKeyError):
@@ -42,7 +42,7 @@ def test_hide_reveal_verify_and_info(format: str, tmp_path: Path) -> None:
 def test_large_secrets_are_pruned(format: str) -> None:
     cover, asked = model_of(2500), [keyss.Secret(model_of(1500, 1), "key one")]
     pruning = CarryOptions(format=format, fine_tune="never")  # type: ignore[arg-type]
-    hidden = keyss.hide(cover, asked, method=pruning, width=32, min_psnr=0)
+    hidden = keyss.hide(cover, asked, method=pruning, views=keyss.ViewOptions(32), min_psnr=0)
     assert 250 < hidden.metrics.secret_gaussians[0] < 1000
 
 

@@ -154,7 +154,7 @@ def test_hide_secret_with_outlier(tmp_path: Path, value: float) -> None:
         tmp_path / "cover.ply",
         [Secret(tmp_path / "secret.ply", KEY)],
         method="carry",
-        width=48,
+        views=keyss.ViewOptions(48),
         out=tmp_path / "run",
     )
     assert result.metrics.secrets[0].psnr > 45

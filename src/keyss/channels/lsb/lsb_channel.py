@@ -23,11 +23,9 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from keyss.channels.base import SALTS_TRIED, Capacity, Channel, Payload, check_keys, randomness
 from keyss.channels.lsb import wet_paper
@@ -67,25 +65,19 @@ class LowBits(Channel):
 
     place = "low bits"
 
-    def __init__(self) -> None:
-        # Cache by cover, valid while its tensors keep their versions: (versions, carriers, rows of salts).
-        self._found: WeakKeyDictionary[Gaussians, tuple[list[int], Carriers, Integers]] = WeakKeyDictionary()
-
     def prepare(self, cover: Gaussians) -> LowBitsCover:
         """See `Channel`. Raises UsageError for low bits that are few or not random, and for stale salts."""
-        layout, versions = Layout.of(cover), _versions(cover)
-        if (found := self._found.get(cover)) is None or found[0] != versions:
-            carriers = Carriers.of(cover, layout)
-            rows = salt_rows(cover, carriers.ids, layout)
-            first = rows[: 2 * SALTS_TRIED]
-            stale = int((~carriers.usable[LEAST][first]).sum())
-            if stale >= SALTS_TRIED:
-                raise UsageError(
-                    f"{stale} of the first {len(first)} salts of this cover cannot be renewed, and whoever "
-                    "made it could try keys in advance"
-                )
-            found = self._found[cover] = versions, carriers, rows
-        return LowBitsCover(cover, layout, *found[1:])
+        layout = Layout.of(cover)
+        carriers = Carriers.of(cover, layout)
+        rows = salt_rows(cover, carriers.ids, layout)
+        first = rows[: 2 * SALTS_TRIED]
+        stale = int((~carriers.usable[LEAST][first]).sum())
+        if stale >= SALTS_TRIED:
+            raise UsageError(
+                f"{stale} of the first {len(first)} salts of this cover cannot be renewed, and whoever "
+                "made it could try keys in advance"
+            )
+        return LowBitsCover(cover, layout, carriers, rows)
 
     def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
         return LowBitsCapacity.of(gaussians, Layout(sh_degree)).for_payloads()
@@ -295,12 +287,6 @@ class CodesCover:
 def _overhead(width: int) -> int:
     """Maximum bytes of a payload beside its data, in blocks of `width` bytes."""
     return (HEADER_BLOCKS + 1) * width + OVERHEAD
-
-
-def _versions(model: Gaussians) -> list[int]:
-    """The number of in-place changes of each tensor."""
-    tensors: list[Tensor] = [getattr(model, each.name) for each in fields(model)]
-    return [0 if each.is_inference() else each._version for each in tensors]
 
 
 def _derive(key: str, salts: Sequence[bytes]) -> list[DerivedKey]:

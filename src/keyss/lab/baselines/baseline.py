@@ -19,7 +19,7 @@ from keyss.fitting.adam import RowAdam
 from keyss.lab.baselines.baseline_options import BaselineOptions
 from keyss.methods.hidden import Frame, HiddenScene
 from keyss.methods.keyss.training import KeyssTraining, Picture
-from keyss.methods.method import Capabilities, Context, Plan, Source, Stego
+from keyss.methods.method import Capabilities, Context, Prepared, Source, Stego
 from keyss.methods.placed_scene import PlacedScene
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
@@ -141,21 +141,16 @@ class Baseline:
     def name(self) -> str:
         return self.options.method
 
-    def prepare(self, sources: Sequence[Source], options: BaselineOptions) -> BaselineOptions:
-        """Accept all scenes."""
-        return options
+    def prepare(
+        self, sources: Sequence[Source], options: BaselineOptions, earlier: Prepared | None = None
+    ) -> Prepared:
+        """Accept all scenes; both share the Gaussians of one model."""
+        return Prepared.of(options, len(sources), options.joint_plan(1))
 
-    def plan(self, sources: Sequence[Source], options: BaselineOptions) -> Plan:
-        """Both scenes share the Gaussians of one model."""
-        return options.joint_plan(1)
-
-    def hide(
-        self, cover: Source, secrets: Sequence[Source], options: BaselineOptions, context: Context
-    ) -> Stego:
+    def hide(self, sources: Sequence[Source], prepared: Prepared, context: Context) -> Stego:
         """Train both scenes jointly. Raises Interrupted, and InputError for another run's checkpoint."""
-        training = self.training
+        training, options = self.training, prepared.options
         assert training is not None
-        sources = [cover, *secrets]
         run = training(PlacedScene.all_of(sources), [], options, context.device)
         run.train(sources, context)
         return self.stego(*run.result(), run.iterations)

@@ -8,27 +8,30 @@ from dataclasses import dataclass, fields
 from keyss.core.gaussians import Gaussians
 from keyss.lab.baselines.baseline import Baseline, CompanionTensors, Show
 from keyss.lab.baselines.baseline_options import BaselineOptions, BoundOptions
-from keyss.methods.method import Capabilities, Context, Plan, Source, Stego
+from keyss.methods.method import Capabilities, Context, Plan, Prepared, Source, Stego
 
-_NAMES = tuple(each.name for each in fields(Gaussians))
+_NAMES = tuple(field.name for field in fields(Gaussians))
 
 
 @dataclass(frozen=True)
 class BoundMethod(Baseline):
     """See `keyss.methods.method.Method`."""
 
-    def plan(self, sources: Sequence[Source], options: BaselineOptions) -> Plan:
+    def prepare(
+        self, sources: Sequence[Source], options: BaselineOptions, earlier: Prepared | None = None
+    ) -> Prepared:
         """Both models, unchanged."""
         fit = options.fit
-        cover, secret = (fit.max_gaussians if each.given is None else len(each.given) for each in sources)
+        cover, secret = (
+            fit.max_gaussians if source.given is None else len(source.given) for source in sources
+        )
         degree = fit.sh_degree if sources[0].given is None else sources[0].given.sh_degree
-        return Plan(gaussians=cover, sh_degree=degree, secret_gaussians=secret, capacity=secret)
+        plan = Plan(gaussians=cover, sh_degree=degree, secret_gaussians=secret, capacity=secret)
+        return Prepared.of(options, len(sources), plan)
 
-    def hide(
-        self, cover: Source, secrets: Sequence[Source], options: BaselineOptions, context: Context
-    ) -> Stego:
+    def hide(self, sources: Sequence[Source], prepared: Prepared, context: Context) -> Stego:
         """Write the secret's model to a companion file."""
-        (secret,) = secrets
+        cover, secret = sources
         return self.stego(cover.model, CompanionTensors(vars(secret.model)))
 
 

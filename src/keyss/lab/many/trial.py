@@ -175,7 +175,7 @@ def _fit_or_hide(trial: Trial, folder: Path, reporter: Reporter) -> dict[str, fl
             hide(**_hide_arguments(trial, folder, keys_of(trial, folder)), **more)
         else:
             config = cast(FitConfig, trial.options)
-            fit(trial.cover, config=config, **vars(trial.views), device=trial.device, **more)
+            fit(trial.cover, config=config, views=trial.views, device=trial.device, **more)
     kind: type[Any] = HideMetrics if trial.secrets else FitMetrics
     return flat(asdict(read_record(run / METRICS, kind)))
 
@@ -201,7 +201,7 @@ def _hide_arguments(trial: Trial, folder: Path, keys: list[str]) -> dict[str, An
         "cover": trial.cover,
         "secrets": [Secret(*each) for each in zip(trial.secrets, keys or blank, models, strict=True)],
         "method": trial.options,
-        **vars(trial.views),
+        "views": trial.views,
         "cover_model": cover,
         "bound": trial.bound,
         "min_psnr": trial.min_psnr,

@@ -11,50 +11,48 @@ from keyss.channels import APPENDED, Capacity, Channel, PreparedCover
 from keyss.channels.base import NOT_INDEPENDENT
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.methods.carry.carry_options import CarryOptions
+from keyss.fitting.config import FitConfig
 from keyss.methods.codec.precision import finest_size, prune_to_size, usual_size
 from keyss.rendering.orbit import Viewpoints
 
 _BITS_PER_GAUSSIAN = 150, 210  # of a secret that is not fitted yet, with the usual and the finest precision
 _SAMPLE, _FAR_TOO_LARGE = 10_000, 1.5  # Gaussians; times what can be appended
 _TINY = 16  # Gaussians; secrets are not pruned to fewer
-_ANY = '`publish="converted"` has room for all'
 
 
 @dataclass(frozen=True)
 class SecretSize:
     """The size of a secret, at most if it is not fitted yet."""
 
-    count: int
-    model: Gaussians | None = None  # None: not fitted yet
+    count: int  # Gaussians
+    usual: int  # bytes of its payload with the usual precision
+    finest: int
+    fitted: bool
 
     @staticmethod
-    def of(model: Gaussians) -> SecretSize:
-        return SecretSize(len(model), model)
+    def of(model: Gaussians | None, fit: FitConfig) -> SecretSize:
+        """The size of `model`, or of what `fit` will give."""
+        if model is not None:
+            return SecretSize(len(model), usual_size(model), finest_size(model), True)
+        usual, finest = (fit.max_gaussians * bits // 8 for bits in _BITS_PER_GAUSSIAN)
+        return SecretSize(fit.max_gaussians, usual, finest, False)
 
-    @property
-    def payload_bytes(self) -> tuple[int, int]:
-        """Bytes of the secret as a payload, with the usual and the finest precision."""
-        if self.model is None:
-            usual, finest = (self.count * each // 8 for each in _BITS_PER_GAUSSIAN)
-            return usual, finest
-        return usual_size(self.model), finest_size(self.model)
 
-    def check_appended(self) -> None:
-        """Raise UsageError for a secret far too large for appended Gaussians, by a sample of it.
+def check_appended(model: Gaussians) -> None:
+    """Raise UsageError for a secret far too large for appended Gaussians, by a sample of it.
 
-        A sparse sample takes more bits for positions: log2 of the distance between its Gaussians.
-        """
-        step, most = self.count // _SAMPLE, APPENDED.estimate_capacity(0, 0).bytes
-        if self.model is None or step < 2:
-            return
-        sample = self.model[::step]
-        size = self.count * (usual_size(sample) / len(sample) - math.log2(step) / 8)
-        if size > _FAR_TOO_LARGE * most:
-            raise UsageError(
-                f"the secret takes about {size:,.0f} bytes, and {most:,} can be "
-                "appended; fewer Gaussians or a lower SH degree take less"
-            )
+    A sparse sample takes more bits for positions: log2 of the distance between its Gaussians.
+    """
+    step, most = len(model) // _SAMPLE, APPENDED.estimate_capacity(0, 0).bytes
+    if step < 2:
+        return
+    sample = model[::step]
+    size = len(model) * (usual_size(sample) / len(sample) - math.log2(step) / 8)
+    if size > _FAR_TOO_LARGE * most:
+        raise UsageError(
+            f"the secret takes about {size:,.0f} bytes, and {most:,} can be "
+            "appended; fewer Gaussians or a lower SH degree take less"
+        )
 
 
 @dataclass(frozen=True)
@@ -68,18 +66,12 @@ class CarryCapacity:
     prepared: PreparedCover | None = None  # None: not fitted yet
 
     @staticmethod
-    def of(cover: Gaussians | None, options: CarryOptions) -> CarryCapacity:
-        """The capacity of `cover`. Raises UsageError for a cover without capacity."""
-        channel = options.channel_in(cover)
-        try:
-            if cover is None:
-                count, degree = options.fit.max_gaussians, options.fit.sh_degree
-                return CarryCapacity(count, degree, channel, channel.estimate_capacity(count, degree))
-            prepared = channel.prepare(cover)
-        except UsageError as error:
-            if channel.survives:
-                raise
-            raise UsageError(f"{error}; {_ANY}") from error
+    def of(channel: Channel, cover: Gaussians | None, fit: FitConfig) -> CarryCapacity:
+        """The capacity of `cover`, or of what `fit` will give. Raises UsageError if there is none."""
+        if cover is None:
+            size = fit.max_gaussians, fit.sh_degree
+            return CarryCapacity(*size, channel, channel.estimate_capacity(*size))
+        prepared = channel.prepare(cover)
         return CarryCapacity(len(cover), cover.sh_degree, channel, prepared.capacity, prepared)
 
     def sizes(self, secrets: Sequence[SecretSize]) -> list[int]:
@@ -87,16 +79,15 @@ class CarryCapacity:
 
         Raises UsageError if the cover is too small.
         """
-        limits = shares(self.payloads, [secret.payload_bytes[1] for secret in secrets])
+        limits = shares(self.payloads, [secret.finest for secret in secrets])
         counts = [
-            min(secret.count, secret.count * limit // secret.payload_bytes[0])
+            min(secret.count, secret.count * limit // secret.usual)
             for secret, limit in zip(secrets, limits, strict=True)
         ]
         if any(count < min(_TINY, secret.count) for count, secret in zip(counts, secrets, strict=True)):
             raise UsageError(
                 f"a cover of {self.gaussians:,} Gaussians is too small to hide {len(secrets)} "
-                f"{'secrets' if len(secrets) > 1 else 'secret'} in its {self.channel.place}; "
-                + ('`channel="appended"` has room for all' if self.channel.survives else _ANY)
+                f"{'secrets' if len(secrets) > 1 else 'secret'} in its {self.channel.place}"
             )
         return counts
 
@@ -108,13 +99,13 @@ class CarryCapacity:
         needed = list(map(finest_size, models))
         warn_of_sharing(self.payloads, needed)
         limits = shares(self.payloads, needed)
-        return [prune_to_size(*each) for each in zip(models, limits, viewpoints, strict=True)]
+        return [prune_to_size(*model) for model in zip(models, limits, viewpoints, strict=True)]
 
     def appended(self, secrets: Sequence[SecretSize]) -> int:
         """Approximate number of Gaussians by which the model grows."""
         if not self.payloads.grows:
             return 0
-        return APPENDED.appended_count([secret.payload_bytes[0] for secret in secrets])
+        return APPENDED.appended_count([secret.usual for secret in secrets])
 
 
 def shares(capacity: Capacity, needed: Sequence[int]) -> list[int]:
@@ -128,7 +119,7 @@ def shares(capacity: Capacity, needed: Sequence[int]) -> list[int]:
     total = int(capacity.bytes * capacity.further ** (count - 1))
     steps = capacity.steps or [(1 / part, total // part) for part in (4, 2, 1)]
     chosen = [
-        next((each for each in steps if size <= each[1] - capacity.overhead), steps[-1]) for size in needed
+        next((step for step in steps if size <= step[1] - capacity.overhead), steps[-1]) for size in needed
     ]
     limits = [limit for _, limit in chosen]
     if count > 1 and (capacity.grows or not capacity.divisible or sum(part for part, _ in chosen) > 1):

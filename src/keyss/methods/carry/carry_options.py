@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from keyss.fitting.config import FitConfig
-from keyss.methods.method import CommandLineOption, MethodOptions, Training
+from keyss.methods.method import CommandLineOption, MethodOptions
 
 FINE_TUNING = 1.15  # fine-tuning steps / fit steps, with photos; at 1, secrets lose 0.15 dB
 
@@ -28,32 +28,17 @@ class CarryOptions(MethodOptions):
         None  # steps of fine-tuning; None: FINE_TUNING per step of `fit`, fewer without photos
     )
 
-    fine_tuning_steps: tuple[int, ...] = ()  # set by `prepare`: of each secret; 0: no fine-tuning
-
     @property
     def may_train(self) -> bool:
-        """True unless the options exclude fine-tuning."""
+        """True unless fine-tuning is excluded."""
         return self.fine_tune != "never"
 
-    @property
-    def may_show(self) -> bool:
-        """True if secrets that cannot be hidden unnoticed may be hidden visibly."""
-        return self.publish == "unchanged" and self.fine_tune == "auto" and self.format is None
-
     def fits(self, scenes: int) -> list[FitConfig]:
-        """A secret without fine-tuning gets its steps in addition."""
-        alone = round((1 + FINE_TUNING) * self.fit.iterations)
-        of_secrets = [
-            replace(self.fit, iterations=self.fit.iterations if steps else alone)
-            for steps in self.fine_tuning_steps or (0,) * (scenes - 1)
-        ]
-        return [self.fit, *of_secrets]
-
-    def training(self, scenes: int) -> tuple[Training, ...]:
-        """Fine-tuning."""
-        return (Training(), *map(Training, self.fine_tuning_steps or (0,) * (scenes - 1)))
+        """Secrets get the steps of fine-tuning in addition, which they do without."""
+        secret = replace(self.fit, iterations=round((1 + FINE_TUNING) * self.fit.iterations))
+        return [self.fit] + [secret] * (scenes - 1)
 
     def with_fit(self, **changes: Any) -> Self:
         """Options with changed fields of `fit`; `iterations` also changes those of fine-tuning."""
-        found = super().with_fit(**changes)
-        return replace(found, iterations=changes["iterations"]) if "iterations" in changes else found
+        options = super().with_fit(**changes)
+        return replace(options, iterations=changes["iterations"]) if "iterations" in changes else options

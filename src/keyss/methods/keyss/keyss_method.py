@@ -35,7 +35,7 @@ from keyss.methods.hidden import Frame, HiddenScene, Recovered
 from keyss.methods.keyss.decoder import Decoder
 from keyss.methods.keyss.keyss_options import DecoderShape, KeyssOptions, parse_mask
 from keyss.methods.keyss.training import KeyssTraining
-from keyss.methods.method import Capabilities, Context, Plan, Source, Stego
+from keyss.methods.method import Capabilities, Context, Prepared, Source, Stego
 from keyss.methods.placed_scene import PlacedScene
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
@@ -61,10 +61,13 @@ class KeyssMethod:
     capabilities = Capabilities()
     options = KeyssOptions
 
-    def prepare(self, sources: Sequence[Source], options: KeyssOptions) -> KeyssOptions:
-        """Set the design's loss. Warns (KeyssWarning) if models are too small for the payloads' low bits.
+    def prepare(
+        self, sources: Sequence[Source], options: KeyssOptions, earlier: Prepared | None = None
+    ) -> Prepared:
+        """All scenes share the Gaussians of one model, with the loss of the design.
 
-        Raises BackendError if CLIP is missing.
+        Warns (KeyssWarning) if models are too small for the payloads' low bits. Raises BackendError if CLIP
+        is missing.
         """
         design, secrets = options.configuration, len(sources) - 1
         if design.ssim_weight is not None:
@@ -76,21 +79,16 @@ class KeyssMethod:
             check_payload_fits(len(probe.payload().data), options.fit.max_gaussians, secrets, shape.sh_degree)
         except UsageError as error:
             warnings.warn(f"{error}; {_APPENDED}", KeyssWarning, stacklevel=2)
-        return options
+        plan = replace(options.joint_plan(secrets), notes=(_COST,))
+        return Prepared.of(options, len(sources), plan)
 
-    def plan(self, sources: Sequence[Source], options: KeyssOptions) -> Plan:
-        """All scenes share the Gaussians of one model."""
-        return replace(options.joint_plan(len(sources) - 1), notes=(_COST,))
-
-    def hide(
-        self, cover: Source, secrets: Sequence[Source], options: KeyssOptions, context: Context
-    ) -> Stego:
+    def hide(self, sources: Sequence[Source], prepared: Prepared, context: Context) -> Stego:
         """Train the cover and the secrets jointly, and hide a payload for each secret.
 
         Warns (KeyssWarning) if density control added nothing. Raises Interrupted on Ctrl-C, and InputError
         for a checkpoint of another run.
         """
-        keys, sources = [each.key for each in secrets], [cover, *secrets]
+        options, keys = prepared.options, [each.key for each in sources[1:]]
         entropy = context.entropy or os.urandom(32)
         if encoder := _encoder(options):
             vectors = [encoder(key) for key in keys]

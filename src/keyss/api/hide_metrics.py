@@ -1,0 +1,130 @@
+"""The measurements of a hiding, and a check that it is good enough to be published."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+
+from keyss.core.errors import KeyssWarning, QualityError
+from keyss.core.gaussians import Gaussians
+from keyss.fitting.image_metrics import quality
+from keyss.measure.hide_quality import BaselineQuality, Shown, compare, measure_hiding
+from keyss.methods.method import Prepared, Source, Stego, Training
+from keyss.methods.plain_models import Bound
+from keyss.runs.run_records import HideMetrics
+
+_MIN_PSNR = 20.0  # dB to the plain model; below it, renders show something else
+_MIN_PRUNED_PSNR = 25.0  # dB, for secrets that lost Gaussians without fine-tuning
+_FAR = 30.0  # dB to the plain model; differences are visible below it
+_PSNR_TOLERANCE, _SSIM_TOLERANCE = 3.0, 0.1  # dB and SSIM to photos, below the plain model's
+# dB. Empty renders score high for dark or small objects, and highest for invisible ones.
+_BETTER_THAN_NOTHING, _GOOD, _EMPTY = 3.0, 40.0, 119.0
+
+
+@dataclass(frozen=True)
+class PlainModel:
+    """What the measurements need of a plain model."""
+
+    gaussians: int
+    sh_degree: int
+    steps: int | None  # training steps; None: the model was given, unknown
+    bound: Bound  # the upper bound of its scene
+
+    @staticmethod
+    def of(source: Source, training: Training, steps: int | None) -> PlainModel:
+        return PlainModel(len(source.model), source.model.sh_degree, steps, Bound.of(training, steps))
+
+
+def compare_with(device: torch.device, source: Source, model: Gaussians) -> Shown:
+    """Compare a model with the test views of its scene, and with its plain model or renders of it."""
+    plain = source.given.to(device) if source.given is not None else None
+    return compare(model.to(device), plain, source.scene, of_plain=not source.photos)
+
+
+def check_quality(
+    shown: Sequence[Shown],
+    min_psnr: float | None,
+    models: Sequence[Gaussians],
+    plain: Sequence[PlainModel],
+    prepared: Prepared,
+    *,
+    resumes: bool,
+) -> None:
+    """Raise QualityError if the cover or a secret is too far from its plain model; warn if it is far.
+
+    `models`: the stego model and the revealed ones. `resumes`: `resume` skips finished training.
+    """
+    again = ", and `resume=True` skips finished training" * resumes
+    for index, (render, model, before) in enumerate(zip(shown, models, plain, strict=True)):
+        fidelity = render.fidelity
+        if fidelity is None or render.plain is None:
+            continue
+        who = "the cover" if index == 0 else "the secret" if len(shown) == 2 else f"secret {index}"
+        pruned = len(model) < before.gaussians
+        kept = f" with {len(model):,} of {before.gaussians:,} Gaussians" if pruned else ""
+        fact = f"{who}{kept} is at {fidelity.psnr:.1f} dB PSNR to its plain model"
+        cure = '; `publish="converted"` keeps all of them, and shows that there is a secret' * (
+            pruned and not prepared.survives
+        )
+        least = _MIN_PRUNED_PSNR if pruned and not prepared.trains else _MIN_PSNR
+        limit = least if min_psnr is None else min_psnr
+        if fidelity.psnr < limit:
+            raise QualityError(
+                f"{fact}, below {limit:g} dB: nothing was published; a lower `min_psnr` publishes it"
+                f"{again}{cure}"
+            )
+        better = min(fidelity.nothing + _BETTER_THAN_NOTHING, _GOOD)
+        if limit > 0 and (fidelity.psnr < better or fidelity.nothing > _EMPTY):
+            raise QualityError(
+                f"{fact}, and empty renders are at {fidelity.nothing:.1f} dB: nothing was published; "
+                f"`min_psnr=0` publishes it anyway{again}{cure}"
+            )
+        psnr_lost = render.plain.psnr - render.quality.psnr
+        ssim, plain_ssim = render.quality.ssim, render.plain.ssim
+        if min_psnr is None and (
+            (psnr_lost > _PSNR_TOLERANCE and fidelity.psnr < _FAR) or ssim < plain_ssim - _SSIM_TOLERANCE
+        ):
+            ssims = f"SSIM {ssim:.2f} where the plain model has {plain_ssim:.2f}"
+            warnings.warn(f"{fact}, {ssims}{cure}", KeyssWarning, stacklevel=3)
+
+
+def hide_metrics(
+    stego: Stego,
+    models: Sequence[Gaussians],  # the stego model and the revealed ones
+    sources: Sequence[Source],  # these and the next: the cover, then the secrets
+    shown: Sequence[Shown],
+    plain: Sequence[PlainModel],
+    longer: Mapping[int, Gaussians],  # the upper bounds that were fitted, by index
+    prepared: Prepared,
+    device: torch.device,
+) -> HideMetrics:
+    """The content of `metrics.json`, without the time of the run."""
+    scenes, seed = [source.scene for source in sources], prepared.options.fit.known_seed
+    qualities, steps = [render.plain for render in shown], [before.steps for before in plain]
+    sizes, equal = [before.gaussians for before in plain], [before.bound.equal for before in plain]
+    for index, model in longer.items():
+        scene = scenes[index]
+        qualities[index] = quality(model.to(device), scene.test, scene.background.to(device))
+        sizes[index], steps[index], equal[index] = len(model), plain[index].bound.steps, True
+    baseline = BaselineQuality(qualities[0], tuple(qualities[1:]), tuple(sizes), tuple(steps), tuple(equal))
+    measured = measure_hiding(stego.gaussians.to(device), stego.opened, scenes, shown, baseline, seed=seed)
+    return HideMetrics(
+        **vars(measured),
+        method=prepared.options.method,
+        gaussians=len(stego.gaussians),
+        photos=tuple(source.photos for source in sources),
+        secret_gaussians=tuple(map(len, models[1:])),
+        secret_degrees=tuple(
+            (model.sh_degree, before.sh_degree) for model, before in zip(models[1:], plain[1:], strict=True)
+        ),
+        iterations=stego.iterations,
+        steps=tuple(before.bound.steps for before in plain),
+        seconds=0.0,
+        width=scenes[0].train[0].camera.width,
+        seed=seed,
+        against_plain=tuple(render.fidelity for render in shown if render.fidelity is not None),
+        details=stego.details,
+    )
