@@ -24,7 +24,7 @@ _SECONDS = {
     "hide a file": 10.0,
     "export": 1.0,
     "render": 10.0,
-    "prepare": 10.0,
+    "prepare": 7.0,
     ".compressed.ply": 9.0,  # before its own end
     ".ply": 3.0,
     ".spz": 13.0,

@@ -197,8 +197,8 @@ def _mark(rows: Any, near: Any, geometry: Any, sh: Any, depth: int, apart: Any) 
 def _pairs(rows: Any, near: Any, geometry: Any, sh: Any, depth: int, found: Any) -> int:
     """List pairs of numbers that differ by equal steps between `rows` and their neighbours; how many.
 
-    `found` [M, 7]: one number of row and neighbour, the other one, row and neighbour, 1 for harmonics. Lists at
-    most M. Steps of up to two cells do not count: many are that small by chance.
+    `found` [M, 7]: one number of row and neighbour, the other one, row and neighbour, 1 for harmonics. Lists
+    at most M. Steps of up to two cells do not count: many are that small by chance.
     """
     groups, count = geometry.shape[2] + 3 * (sh.shape[1] > 1), 0
     x, y = np.full((groups, _LANES), _NAN, np.uint32), np.zeros((groups, _LANES), np.uint32)

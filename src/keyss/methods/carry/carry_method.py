@@ -124,7 +124,8 @@ class CarryMethod:
                         photos=secret.photos,
                         name=role_of(index + 1, len(sources)),
                     )
-        with context.waiting("hiding", seconds_to_hide(len(cover.model), [*map(len, models)])):
+        seconds = seconds_to_hide(len(cover.model), [*map(len, models)], prepared.grows)
+        with context.waiting("hiding", seconds):
             stego = embed_models(
                 capacity.prepared,
                 [secret.key for secret in secrets],
