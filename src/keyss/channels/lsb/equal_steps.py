@@ -56,14 +56,18 @@ class Steps:
 
             in_blocks(search, len(means), _ROWS)
 
-    def equal(self, depth: int) -> Flags:
-        """Mask [N] of Gaussians that moved by equal amounts, by the bits that stay at a depth."""
+    def equal(self, depth: int, among: Flags | None = None) -> Flags:
+        """Mask [N] of Gaussians that moved by equal amounts, by the bits that stay at a depth.
+
+        `among` [N]: those that did at a larger depth, where steps are less exact.
+        """
+        rows = self.order if among is None else self.order[among[self.order]]
         apart = np.zeros(len(self.order), bool)
 
         def mark(start: int, stop: int) -> None:
-            _mark(self.order[start:stop], self.near, *self.words, depth, apart)
+            _mark(rows[start:stop], self.near, *self.words, depth, apart)
 
-        in_blocks(mark, len(apart), _ROWS, _mark)
+        in_blocks(mark, len(rows), _ROWS, _mark)
         return apart
 
     def chance(self, depth: int, usable: Flags) -> float:
