@@ -7,8 +7,8 @@ Constant colours, which are never written, move by the same amount times the rat
 
 A Gaussian is left alone if three numbers of a group (the harmonics of a colour, a quaternion, or scales and
 opacity) moved by equal amounts away from zero or from one of its nearest neighbours, up to the precision of
-the bits that stay. No rate of a trainer is assumed. By chance two agree in many Gaussians; whether these
-predict low bits is tested on each model, at each depth.
+the bits that stay at all depths. No rate of a trainer is assumed. By chance two agree in many Gaussians;
+whether these predict low bits is tested on each model, at each depth.
 """
 
 from __future__ import annotations
