@@ -20,11 +20,10 @@ from keyss import read_model
 from codes import against_photos
 from keyss.channels import DEPTHS, LEAST, TYPICAL_SHARE, Layout, LowBitsCapacity, usable_carriers
 from keyss.core import Gaussians, KeyssError, Scene
-from keyss.files.scenes import load_scene
+from keyss.files import load_scene
 from keyss.fitting import psnr
 from keyss.lab import random_pruning
-from keyss.rendering import render
-from keyss.rendering.orbit import psnr_between
+from keyss.rendering import psnr_between, render
 from methods.carry.carried import embed, extract
 
 KEY = "the key of the benchmark"

@@ -31,11 +31,9 @@ from typing import Any
 
 from keyss import lab
 from keyss.channels import COLOURS, ColoursCover, ColoursReader, Payload
-from keyss.core.errors import BackendError, InputError, WrongKeyError
-from keyss.core.gaussians import Gaussians
-from keyss.core.similarity import Similarity
-from keyss.files.models import read_model, write_model
-from keyss.rendering.orbit import psnr_between
+from keyss.core import BackendError, Gaussians, InputError, Similarity, WrongKeyError
+from keyss.files import FORMATS as FILE_FORMATS, read_model, write_model
+from keyss.rendering import psnr_between
 
 import numpy as np
 import torch
@@ -228,8 +226,9 @@ def _chain(first: Change, second: Change) -> Change:
     return lambda model: second(first(model))
 
 
-_SUFFIXES = (".ply", ".spz", ".sog", ".compressed.ply", ".glb", ".splat")
-OWN: dict[str, Change] = {f"`{suffix}` by keyss": _convert_by_keyss(suffix) for suffix in _SUFFIXES}
+OWN: dict[str, Change] = {
+    f"`{suffix}` by keyss": _convert_by_keyss(suffix) for each in FILE_FORMATS for suffix in each.suffixes
+}
 _BY_TOOL: dict[str, Change] = {f"{each.format} by {each.tool}": each for each in lab.converters()}
 FORMATS: dict[str, Change] = {"raw `.ply`": lambda model: model, **_BY_TOOL}
 OTHERS: dict[str, Change] = {

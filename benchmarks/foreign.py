@@ -22,15 +22,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from colours import FORMATS, OTHERS, OWN, cheap_keys, sampled
-from keyss.channels import APPENDED, COLOURS, AppendedReader, Payload
+from keyss.channels import APPENDED, COLOURS, AppendedReader, Carriers, Payload
 from keyss.channels.colours import carriers as salting
-from keyss.channels.colours.carriers import Carriers, find_salts
-from keyss.core import Gaussians, Similarity
+from keyss.channels.colours.carriers import find_salts
+from keyss.core import BackendError, Gaussians, InputError, KeyssWarning, Similarity, WrongKeyError
 from keyss.core.arrays import Doubles
-from keyss.core.errors import BackendError, InputError, KeyssWarning, WrongKeyError
-from keyss.files.models import read_model
-from keyss.lab.auc import auc_between
-from keyss.rendering.orbit import psnr_between
+from keyss.files import read_model
+from keyss.lab import auc_between
+from keyss.rendering import psnr_between
 
 import numpy as np
 import torch

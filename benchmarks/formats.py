@@ -17,11 +17,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from keyss.core import BackendError, Gaussians
-from keyss.core.similarity import Similarity
-from keyss.files.models import read_model, write_model
+from keyss.core import BackendError, Gaussians, Similarity
+from keyss.files import read_model, write_model
 from keyss.lab import transform
-from keyss.rendering.orbit import psnr_between
+from keyss.rendering import psnr_between
 
 import numpy as np
 import torch

@@ -3,18 +3,10 @@
     python benchmarks/gpu.py ../shared/data --results out/gpu
     python benchmarks/gpu.py ../shared/data --device cpu --gaussians 2000 --width 120 --seconds 60
 
-For a machine without a network, `--wheels FOLDER` installs the wheels of a folder, without their
-dependencies, for this run only. Beside torch, numpy, numba, scipy, OpenCV, pillow, psutil, rich, safetensors,
-jaxtyping, ninja, pytest and hypothesis, a machine with Python 3.12 needs these (21 MB):
-
-    python -m pip download --no-deps --only-binary=:all: --python-version 3.12 --implementation cp \\
-      --platform manylinux_2_28_x86_64 --platform manylinux2014_x86_64 -c requirements/constraints.txt \\
-      -d wheels gsplat argon2-cffi argon2-cffi-bindings cffi cryptography docstring-parser filelock gsply \\
-      lazy-loader msgspec pycparser tyro typeguard zstandard zxcvbn
-
 gsplat's wheel has sources, which the first stage compiles for the GPU that is there: that takes nvcc, and
-minutes on 16 cores. A wheel that was compiled elsewhere (`TORCH_CUDA_ARCH_LIST=9.0 pip wheel --no-deps
---no-build-isolation` of gsplat's source archive, with the same Python and torch) skips that.
+minutes on 16 cores. A wheel compiled elsewhere (`TORCH_CUDA_ARCH_LIST=9.0 pip wheel --no-deps
+--no-build-isolation` of gsplat's source archive, with the same Python and torch) skips that. On a machine
+without a network, `pip install --no-index --no-deps --target site wheels/*.whl` and PYTHONPATH=site:src.
 
 Stages are processes that follow one another: `kernels`, `tests`, `pilot`, which measures a step of every
 method at the full number of Gaussians and chooses how many fit into `--seconds`, `plain`, the designs of
@@ -39,11 +31,26 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:  # `--wheels` may install what they need
-    from keyss import FitConfig, Gaussians
-    from keyss.core import Scene
+from keyss import (
+    CarryOptions,
+    FitConfig,
+    Gaussians,
+    KeyssOptions,
+    Secret,
+    fit,
+    hide,
+    load_scene,
+    read_model,
+    reveal,
+)
+from keyss.core import Scene
+from keyss.progress import Reporter
+from keyss.rendering import render, resolve_device
+
+import torch
+from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 COVER, SECRET = "bonsai", "fox"
@@ -65,7 +72,6 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=540, help="seconds for everything")
     parser.add_argument("--steps", type=int, help="of each training, instead of as many as fit")
     parser.add_argument("--stages", nargs="+", default=STAGES, choices=STAGES)
-    parser.add_argument("--wheels", type=Path, help="folder of wheels to install")
     parser.add_argument("--results", type=Path, default=Path("out/gpu"))
     parser.add_argument("--work", type=Path, help="folder for models; by default a temporary one")
     parser.add_argument("--stage", help=argparse.SUPPRESS)
@@ -77,27 +83,11 @@ def main() -> None:
         options.work = options.work or Path(folder)
         for each in (options.work, options.results):
             each.mkdir(parents=True, exist_ok=True)
-        install(options)
         sys.exit(run_all(options))
-
-
-def install(options: argparse.Namespace) -> None:
-    """Install `--wheels`, for this process and for the stages."""
-    paths = [str(ROOT / "src"), *filter(None, [os.environ.get("PYTHONPATH")])]
-    if options.wheels:
-        site = str(options.work / "site")
-        pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--no-compile"]
-        wheels = map(str, sorted(options.wheels.glob("*.whl")))
-        subprocess.run([*pip, "--upgrade", "--target", site, *wheels], check=True)
-        paths.insert(1, site)
-    sys.path[:0] = paths
-    os.environ["PYTHONPATH"] = os.pathsep.join(paths)
 
 
 def run_all(options: argparse.Namespace) -> int:
     """Run the stages, and write the results after each; returns 1 if one failed."""
-    import torch
-
     if options.device == "cuda":  # otherwise gsplat is compiled for all architectures
         capability = "{}.{}".format(*torch.cuda.get_device_capability())
         os.environ.setdefault("TORCH_CUDA_ARCH_LIST", capability)
@@ -143,10 +133,6 @@ def run_all(options: argparse.Namespace) -> int:
 
 def run_stage(stage: str, options: argparse.Namespace) -> dict[str, float]:
     """What a stage measures, by name and unit."""
-    import keyss  # noqa: F401  before torch, see `ruff.toml`
-
-    import torch
-
     own = {"kernels": kernels, "tests": tests, "pilot": pilot, "plain": plain}
     found = own[stage](options) if stage in own else hidden(stage, options)
     found["memory, GiB"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
@@ -157,8 +143,6 @@ def run_stage(stage: str, options: argparse.Namespace) -> dict[str, float]:
 
 def kernels(options: argparse.Namespace) -> dict[str, float]:
     """Compile gsplat's kernels or load them, and render with them."""
-    from keyss.rendering import resolve_device
-
     started = time.monotonic()
     resolve_device(options.device)
     seconds = time.monotonic() - started
@@ -176,8 +160,6 @@ def tests(options: argparse.Namespace) -> dict[str, float]:
 
 def pilot(options: argparse.Namespace) -> dict[str, float]:
     """Seconds of a step of every training with all Gaussians, and how many steps fit."""
-    from keyss import Secret, fit, hide
-
     cover, secret = (dense(scene, options.gaussians) for scene in scenes(options))
     config = replace(fit_config(options, PILOT_STEPS), grow_every=10**6)  # the number of Gaussians stays
     plains: list[Gaussians] = []
@@ -201,8 +183,6 @@ def pilot(options: argparse.Namespace) -> dict[str, float]:
 
 def plain(options: argparse.Namespace) -> dict[str, float]:
     """The bounds: plain 3DGS of each scene alone, with as many Gaussians and steps."""
-    from keyss import fit, read_model
-
     found, models = {}, []
     for role, scene in zip(("cover", "secret"), scenes(options), strict=True):
         clock, folder = Clock(options.device), options.work / role
@@ -218,8 +198,6 @@ def plain(options: argparse.Namespace) -> dict[str, float]:
 
 def hidden(name: str, options: argparse.Namespace) -> dict[str, float]:
     """One hiding from photos to the published file, and what it reveals."""
-    from keyss import Secret, hide, read_model, reveal
-
     (cover, secret), clock = scenes(options), Clock(options.device)
     plains, out = [options.work / role / "model.ply" for role in ("cover", "secret")], options.work / name
     began = time.monotonic()
@@ -245,11 +223,6 @@ def hidden(name: str, options: argparse.Namespace) -> dict[str, float]:
 
 def draw(name: str, options: argparse.Namespace, *models: Gaussians) -> None:
     """Save renders of both scenes, each beside the photo, in one row."""
-    from keyss.rendering import render
-
-    import torch
-    from PIL import Image
-
     parts = []
     for model, scene in zip(models, scenes(options), strict=True):
         view = scene.test[len(scene.test) // 2]
@@ -266,29 +239,21 @@ def draw(name: str, options: argparse.Namespace, *models: Gaussians) -> None:
 
 def scenes(options: argparse.Namespace) -> list[Scene]:
     """The cover's and the secret's."""
-    from keyss import load_scene
-
     return [load_scene(options.data / name, width=options.width) for name in (COVER, SECRET)]
 
 
 def dense(scene: Scene, count: int) -> Scene:
     """The scene with so many sparse points that trainings begin with `count` Gaussians."""
-    import torch
-
     chosen = torch.arange(count) % len(scene.points)
     spread = 1e-3 * scene.extent * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
     return replace(scene, points=scene.points[chosen] + spread, colors=scene.colors[chosen])
 
 
 def fit_config(options: argparse.Namespace, steps: int) -> FitConfig:
-    from keyss import FitConfig
-
     return FitConfig(iterations=steps, max_gaussians=options.gaussians, seed=0, evaluate_every=0)
 
 
 def method_of(name: str, config: FitConfig) -> Any:
-    from keyss import CarryOptions, KeyssOptions
-
     return CarryOptions(fit=config) if name == "carry" else KeyssOptions(fit=config, design=name)
 
 
@@ -296,10 +261,8 @@ class Enough(Exception):
     """A pilot knows how long a step takes."""
 
 
-class Clock:
-    """A `keyss.progress.Reporter` that measures a training."""
-
-    loss_every = 0
+class Clock(Reporter):
+    """Measures a training."""
 
     def __init__(self, device: str, *, every_step: bool = False) -> None:
         self.device, self.every_step = device, every_step
@@ -307,8 +270,6 @@ class Clock:
         self.steps = 0
 
     def tick(self) -> None:
-        import torch
-
         if self.device == "cuda":
             torch.cuda.synchronize()
         self.times.append(time.perf_counter())
@@ -326,14 +287,8 @@ class Clock:
     def finish(self) -> None:
         self.tick()
 
-    def look(self, model: Any) -> None:
-        pass
-
     def note(self, line: str) -> None:
         print(line, flush=True)
-
-    def of_secret(self) -> Clock:
-        return self
 
     def typical(self) -> float:
         """The median of seconds a step, without the first ten."""

@@ -22,10 +22,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import keyss
-from keyss.core.gaussians import Gaussians
+from keyss.core import Gaussians
 from keyss.methods import CarryOptions
-from keyss.viewer.page import export_html
-from keyss.viewer.serving import ModelServer
+from keyss.viewer import ModelServer, export_html
 
 import torch
 from playwright.sync_api import sync_playwright

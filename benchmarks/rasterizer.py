@@ -13,7 +13,6 @@ import os
 import platform
 import resource
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,17 +22,10 @@ from typing import Any
 
 from keyss.core import Camera, Gaussians
 from keyss.files import read_model
-from keyss.fitting.config import FitConfig
-from keyss.fitting.losses import Target, photometric_loss
-from keyss.fitting.parameters import make_optimizers, to_gaussians, to_parameters
 from keyss.rendering import rasterization, render
 
 import torch
 from torch import Tensor
-
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "tests"))
-from rendering.dense_reference import dense_rasterization  # noqa: E402
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,11 +95,9 @@ class Clock:
         self.times.setdefault(part, []).append(1e3 * (time.perf_counter() - start))
         return result
 
-    def best(self, part: str) -> float:
-        return min(self.times[part][1:])
-
     def text(self, part: str) -> str:
-        return f"{self.best(part):.1f} ({statistics.median(self.times[part][1:]):.1f})"
+        times = self.times[part][1:]
+        return f"{min(times):.1f} ({statistics.median(times):.1f})"
 
 
 def leaves_of(model: Gaussians) -> list[Tensor]:
@@ -120,17 +110,13 @@ def draw(leaves: list[Tensor], camera: Camera, sh_degree: int) -> Tensor:
     return rasterization(*leaves, camera.viewmat, camera.K, *size, sh_degree=sh_degree)[0]
 
 
-def weights_for(camera: Camera) -> Tensor:
-    """Gradients of the pixels."""
-    return torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
-
-
 def measure_rasterizer(case: Case, threads: int, repeats: int) -> list[str]:
-    """One row of the first table."""
+    """One row of the table."""
     torch.set_num_threads(threads)
     load_kernels()  # not counted as peak memory
     gaussians, camera = case.scene()
-    leaves, weights, clock = leaves_of(gaussians), weights_for(camera), Clock()
+    leaves, clock = leaves_of(gaussians), Clock()
+    weights = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
     work = partial(draw, leaves, camera, gaussians.sh_degree)
     before = _memory()
     for _ in range(repeats + 1):
@@ -144,61 +130,6 @@ def measure_rasterizer(case: Case, threads: int, repeats: int) -> list[str]:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
     times = map(clock.text, ("only", "forward", "backward"))
     return [f"{case.name}, {case.width}x{case.height}", str(threads), *times, f"{peak / 2**20:.0f}"]
-
-
-def measure_step(case: Case, threads: int, repeats: int) -> list[str]:
-    """One row of the second table: the cost of a training step relative to the rasterizer."""
-    torch.set_num_threads(threads)
-    gaussians, camera = case.scene()
-    config = FitConfig()
-    with torch.no_grad():
-        target = Target.of(render(gaussians, camera).clamp(0, 1).flip(1))
-    parameters = to_parameters(gaussians, torch.device("cpu"))
-    optimizers = make_optimizers(parameters, config, 1.0)
-    weights, clock = weights_for(camera), Clock()
-
-    def update() -> None:
-        for optimizer in optimizers.values():
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
-
-    for _ in range(repeats + 1):
-        leaves = leaves_of(to_gaussians(parameters))
-        image = clock("rasterizer forward", partial(draw, leaves, camera, gaussians.sh_degree))
-        clock("rasterizer backward", partial(image.backward, weights))
-        del leaves
-        image = clock("render", lambda: render(to_gaussians(parameters), camera))
-        loss = clock("loss", partial(photometric_loss, image, target, config.ssim_weight))
-        clock("backward", loss.backward)
-        clock("optimiser", update)
-    rasterizer = clock.best("rasterizer forward") + clock.best("rasterizer backward")
-    parts = [clock.best(name) for name in ("render", "loss", "backward", "optimiser")]
-    numbers = [f"{part:.1f}" for part in (rasterizer, *parts, sum(parts))]
-    ratio = f"{sum(parts) / rasterizer:.2f}"
-    return [f"{case.name}, {case.width}x{case.height}", str(threads), *numbers, ratio]
-
-
-def measure_against_torch(threads: int, repeats: int) -> list[str]:
-    """One row of the third table: plain torch, all Gaussians at all pixels, on a small scene."""
-    torch.set_num_threads(threads)
-    case = Case(name="1000 synthetic", width=64, height=48, count=1000)
-    gaussians, camera = case.scene()
-    leaves, weights, clock = leaves_of(gaussians), weights_for(camera), Clock()
-    view = (camera.viewmat, camera.K, camera.width, camera.height)
-    for _ in range(repeats + 1):
-        image = clock("forward, torch", lambda: dense_rasterization(*leaves, *view, torch.zeros(3), 3)[0])
-        clock("backward, torch", partial(image.backward, weights))
-        image = clock("forward", partial(draw, leaves, camera, 3))
-        clock("backward", partial(image.backward, weights))
-    theirs = [clock.best(f"{part}, torch") for part in ("forward", "backward")]
-    ours = [clock.best(part) for part in ("forward", "backward")]
-    return [
-        f"{case.name}, {case.width}x{case.height}",
-        str(threads),
-        *(f"{each:.1f}" for each in theirs),
-        *(f"{each:.2f}" for each in ours),
-        *(f"{their / our:.0f}" for their, our in zip(theirs, ours, strict=True)),
-    ]
 
 
 def _memory() -> int:
@@ -233,34 +164,19 @@ def main() -> None:
 
     context = multiprocessing.get_context("spawn")
 
-    def run_alone(measurement: Callable[..., list[str]], *arguments: object) -> list[str]:
-        with context.Pool(1) as pool:
-            return pool.apply(measurement, arguments)
-
     n = options.repeats
     pairs = [(case, threads) for case in cases for threads in options.threads]
-    tables = [
-        (
-            ["scene, SH 3", "threads", "forward only", "forward", "backward", "peak MiB"],
-            [run_alone(measure_rasterizer, case, threads, n) for case, threads in pairs],
-        ),
-        (
-            ["training step", "threads", "rasterizer alone", "render", "loss", "backward", "optimiser",
-             "step", "step / rasterizer"],
-            [run_alone(measure_step, case, threads, n) for case, threads in pairs],
-        ),
-        (
-            ["plain torch", "threads", "its forward", "its backward", "our forward", "our backward",
-             "forward, times faster", "backward, times faster"],
-            [run_alone(measure_against_torch, threads, n) for threads in options.threads],
-        ),
-    ]  # fmt: skip
+    titles = ["scene, SH 3", "threads", "forward only", "forward", "backward", "peak MiB"]
+    rows = []
+    for case, threads in pairs:
+        with context.Pool(1) as pool:
+            rows.append(pool.apply(measure_rasterizer, (case, threads, n)))
     heading = (
         f"{platform.machine()}, {os.cpu_count()} cores; Python {platform.python_version()}, torch "
         f"{torch.__version__}. Milliseconds of wall time: the smallest of {n} repeats, and in brackets the "
         "median."
     )
-    print("\n\n".join([heading, *(table(titles, rows) for titles, rows in tables)]))
+    print(f"{heading}\n\n{table(titles, rows)}")
 
 
 if __name__ == "__main__":

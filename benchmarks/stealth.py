@@ -4,7 +4,7 @@
     python benchmarks/stealth.py ... --fine-tuned bonsai=stego.ply:secret.ply  # files, secrets' models
     python benchmarks/stealth.py --pairs bonsai=plain.ply:stego.ply ...     # given files
     python benchmarks/stealth.py ... --rounded   # models like those of trainers that round steps
-    python benchmarks/stealth.py ... --quick     # two random parts of each model, no predictor, no candidates
+    python benchmarks/stealth.py ... --quick     # two random parts of each model, no candidates
 
 Each plain model is made to carry as much of a model of the next scene as fits, and random bytes. Statistics
 are computed for complete models and for parts of 2,000 to 5,000 Gaussians, random ones and pieces of space.
@@ -21,7 +21,6 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import repeat
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -44,11 +43,9 @@ from keyss.rendering import Viewpoints
 from lab.stealth.candidates import candidate_scores
 from methods.carry import carried
 from stealth_detection import Examples, confirmed, learned_detectors, single_detectors
-from stealth_predictor import fit_predictor, predictor_statistics, sample
 
 PART_SIZES = (2000, 5000)
 PAYLOAD_BYTES = 4000
-TRAINING_ROWS, MAX_TRAINED_ON = 20_000, 20  # limits for the predictor
 CANDIDATES = 24
 SHOWN = 8  # single statistics in the table
 
@@ -89,10 +86,6 @@ def main() -> None:
         pieces = [(file, name, piece) for file in files for name, piece in _pieces(file, options.quick)]
         rows = list(pool.map(_statistics, [piece for _, _, piece in pieces], chunksize=4))
         print(f"{len(rows)} pieces after {time.monotonic() - started:.0f} s", file=sys.stderr)
-        if not options.quick:
-            for row, more in zip(rows, _predict(pool, files, pieces), strict=True):
-                row |= more
-            print(f"predicted after {time.monotonic() - started:.0f} s", file=sys.stderr)
         scenes, plain = {file.scene for file in files}, sum(file.kind == "plain" for file in files)
         print(f"{plain} plain models of {len(scenes)} scenes, {time.monotonic() - started:.0f} s\n")
         _print_detections(files, pieces, rows)
@@ -104,7 +97,7 @@ def main() -> None:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("plain", nargs="*", metavar="SCENE=FILE")
-    parser.add_argument("--fine-tuneted", nargs="*", default=[], metavar="SCENE=FILE:SECRET")
+    parser.add_argument("--fine-tuned", nargs="*", default=[], metavar="SCENE=FILE:SECRET")
     parser.add_argument("--pairs", nargs="*", default=[], metavar="SCENE=PLAIN:STEGO")
     parser.add_argument("--rounded", action="store_true")
     parser.add_argument("--quick", action="store_true")
@@ -168,24 +161,6 @@ def _pieces(file: File, quick: bool) -> Iterable[tuple[str, Gaussians]]:
 
 def _statistics(piece: Gaussians) -> dict[str, float]:
     return {name: each.value for name, each in stealth_statistics(piece).items()}
-
-
-def _predict(
-    pool: ProcessPoolExecutor, files: Sequence[File], pieces: Sequence[tuple[File, str, Gaussians]]
-) -> list[dict[str, float]]:
-    """Statistics of each piece's bits, predicted by trees trained on plain models of the other scenes."""
-    plain = [file for file in files if file.kind == "plain"]
-    samples = list(pool.map(sample, [file.model for file in plain], repeat(TRAINING_ROWS), chunksize=2))
-    found: list[dict[str, float]] = [{} for _ in pieces]
-    for scene in dict.fromkeys(file.scene for file in plain):
-        others = [each for file, each in zip(plain, samples, strict=True) if file.scene != scene]
-        trees = fit_predictor(others[:: -(-len(others) // MAX_TRAINED_ON)])
-        own = [index for index, (file, _, _) in enumerate(pieces) if file.scene == scene]
-        models = [pieces[each][2] for each in own]
-        made = pool.map(predictor_statistics, repeat(trees), models, chunksize=4)
-        for index, row in zip(own, made, strict=True):
-            found[index] = row
-    return found
 
 
 def _print_detections(

@@ -22,8 +22,7 @@ import keyss  # noqa: F401  before torch, see `ruff.toml`
 from keyss import FitConfig
 from keyss.core import Scene
 from keyss.files import load_scene
-from keyss.fitting import CappedStrategy, PlainRun, mean_psnr, own_randomness, plain
-from keyss.fitting.adam import RowAdam
+from keyss.fitting import CappedStrategy, PlainRun, RowAdam, mean_psnr, own_randomness, plain
 from keyss.fitting.losses import Targets
 
 import torch

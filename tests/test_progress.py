@@ -104,7 +104,7 @@ def test_time_left_follows_the_pace_of_the_work(timer: Timer) -> None:
     assert str(wait) == "audit: 2:10, longer than estimated"
 
 
-def test_waits_are_logged_while_they_last(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_waits_are_logged(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("keyss.progress._QUIET_SECONDS", 0.05)
     log = console(False)
     with ProgressLines(log).waiting("checking a.ply", 100):

@@ -10,7 +10,7 @@ import pytest
 import keyss
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.cli import main
-from keyss.lab.audits import audit, read_audit, verdicts
+from keyss.lab.audits import audit, read_audit
 
 pytestmark = pytest.mark.slow
 CONFIG = CarryOptions(fit=FitConfig(max_gaussians=20_000, seed=0))
@@ -40,7 +40,7 @@ def test_hide_fox_in_bonsai(run: Path) -> None:
 
 def test_audit_of_leaks_and_robustness(run: Path) -> None:
     audit(run, ["a key for a fox"], controls=2, only=["leaks", "robustness"])
-    words = {line.measure: line.word for line in verdicts(read_audit(run))}
+    words = {line.measure: line.word for line in read_audit(run).verdicts}
     assert words["leaks without the key"] == "fine"
     assert words["loss of a random 25% of the Gaussians"] == "fine"
 
@@ -58,7 +58,7 @@ def test_audit_of_stealth(run: Path, real_data: Path, tmp_path: Path) -> None:
         out=out,
     )
     audit(out, ["a key for a fox"], controls=2, only=["parameters", "leaks"])
-    words = {line.measure: line.word for line in verdicts(read_audit(out))}
+    words = {line.measure: line.word for line in read_audit(out).verdicts}
     for measure in ("attributes of the Gaussians", "classifier between models", "leaks without the key"):
         assert words[measure] == "fine"
 

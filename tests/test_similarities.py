@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 import keyss
 from keyss import FitConfig, Secret
 from keyss.core import KeyssWarning, Scene, Similarity, UsageError
-from keyss.files.scenes import load_scene
+from keyss.files import load_scene
 from keyss.fitting import mean_psnr
 from test_api import write_nerfstudio
 from tiny_scenes import random_gaussians, tiny_scene

@@ -12,7 +12,7 @@ import keyss as package
 from channels.lsb.trained_like import trained_like
 from cli.harness import Run, assert_refused, write_key
 from keyss.core import Similarity
-from keyss.files import read_model, write_model
+from keyss.files import FORMATS, read_model, write_model
 from methods.carry.carried import embed
 from tiny_scenes import random_gaussians
 
@@ -27,8 +27,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_model(folder / "carried.ply", embed(trained_like(1500), [(KEY, trained_like(COUNT, 1))]))
     write_key(folder / "key", KEY)
     write_key(folder / "other")
-    for suffix in ("ply", "spz", "sog", "compressed.ply", "glb", "splat"):
-        write_model(folder / f"plain.{suffix}", random_gaussians(COUNT))
+    for suffix in (suffix for each in FORMATS for suffix in each.suffixes):
+        write_model(folder / f"plain{suffix}", random_gaussians(COUNT))
     return folder
 
 

@@ -15,7 +15,7 @@ from keyss.files import write_model
 
 WITHOUT = f"""
 import json, sys
-for name in ("jinja2", "markupsafe", "ot", "sklearn"):
+for name in ("ot", "sklearn"):
     sys.modules[name] = None
 sys.path.append({str(Path(cheap_keys.__file__).parent)!r})
 import argon2.low_level, cheap_keys
@@ -32,7 +32,6 @@ WORKING = (
 )
 REFUSED = (
     "audit run",
-    "audit run --report-only",
     "compare --cover a --secret b -o out",
     "reproduce masks a b -o out",
 )

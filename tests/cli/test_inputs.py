@@ -32,10 +32,10 @@ def test_run_folder_as_model(keyss: Run, workspace: Path, tmp_path: Path, inside
 
 
 @pytest.mark.parametrize("inside", ["publish/model.ply", "publish", "private", "private/config.json"])
-@pytest.mark.parametrize("command", ["evaluate", "audit", "audit --report-only"])
+@pytest.mark.parametrize("command", ["evaluate", "audit"])
 def test_path_inside_run(keyss: Run, workspace: Path, command: str, inside: str) -> None:
     path = workspace / "hidden" / inside
-    result = keyss(*command.split(), path, *key_argument(workspace))
+    result = keyss(command, path, *key_argument(workspace))
     kind = "a folder" if path.is_dir() else "a file"
     assert_refused(result, 4, f"{path}: expected the folder of a run")
     assert f"found {kind} in one; give {workspace / 'hidden'}" in result.err

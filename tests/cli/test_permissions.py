@@ -51,7 +51,6 @@ def run_all_commands(keyss: Run) -> None:
     assert run("render hidden.ply --cameras b -o images --split all") == "images: 4 images\n"
     assert len(list(Path("images").glob("*.png"))) == 4
     run("audit hidden --key-file key.txt --only parameters --controls 2 --device cpu")
-    run("audit hidden --report-only")
     run("info hidden --json")
 
 
@@ -82,7 +81,7 @@ def test_only_published_files_are_readable(keyss: Run, folder: Path) -> None:
     assert private.keys() == {"plain", "hidden", "carried", "images"}
     for path in private.values():
         assert stat.S_IMODE(path.stat().st_mode) == 0o700
-    for name in ("audit/audit.json", "report.html", "metrics.json", "config.json", "secret-1.ply"):
+    for name in ("audit/audit.json", "report.md", "metrics.json", "config.json", "secret-1.ply"):
         assert (folder / "hidden" / "private" / name).is_file()
     results = {"plain", "hidden", "carried", "hidden.ply", "carried.ply", "images"}
     assert {path.name for path in folder.iterdir()} == {"key.txt", *results}

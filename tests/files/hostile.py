@@ -33,9 +33,8 @@ from files.formats.false_sizes import image
 from files.formats.mutations import peak_memory
 from files.scene_files import camera_bytes, counted, image_bytes, point_bytes
 from keyss.core import InputError
+from keyss.files import load_scene, read_model
 from keyss.files.images import png_names
-from keyss.files.models import read_model
-from keyss.files.scenes import load_scene
 
 SECONDS, MEMORY, PER_BYTE = 5.0, 200 << 20, 32
 KHR = "KHR_gaussian_splatting"

@@ -14,7 +14,7 @@ from keyss.core import Camera
 from keyss.files.images import png_names
 
 
-def test_hostile_files_of_a_megabyte_are_read_within_bounds() -> None:
+def test_hostile_files_stay_within_limits() -> None:
     command = [sys.executable, hostile.__file__, "--json"]
     output = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False).stdout
     costs = [hostile.Cost(**json.loads(line)) for line in output.splitlines()]
@@ -22,7 +22,7 @@ def test_hostile_files_of_a_megabyte_are_read_within_bounds() -> None:
     assert not [each for each in costs if not each.bounded]
 
 
-def test_names_of_pictures_are_numbered_in_linear_time() -> None:
+def test_picture_names_take_linear_time() -> None:
     camera = Camera(torch.eye(4), torch.eye(3), 1, 1, "a/b.jpg")
     cameras = [replace(camera, name=f"a{'/' * (index % 2)}_b.jpg") for index in range(20_000)]
     names = png_names([camera, *cameras])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -9,9 +10,19 @@ import torch
 
 from keyss import info
 from keyss.core import Gaussians, InputError, OutputError, UsageError
-from keyss.files import check_model_output, is_model_path, keeps_low_bits, read_model, write_model
+from keyss.files import (
+    FORMATS,
+    check_model_output,
+    is_model_path,
+    keeps_low_bits,
+    known_suffixes,
+    read_model,
+    write_model,
+)
 from keyss.runs import ModelInfo
 from tiny_scenes import random_gaussians
+
+SUFFIXES = [suffix for each in FORMATS for suffix in each.suffixes]
 
 
 @pytest.mark.parametrize("name", ["a.ply", "b.PLY", "c.Ply"])
@@ -37,13 +48,13 @@ def test_unknown_suffixes(tmp_path: Path, name: str) -> None:
     for write in (lambda path: write_model(path, random_gaussians(5)), lambda p: check_model_output(p, True)):
         with pytest.raises(
             UsageError,
-            match=rf"{name}: expected .* ends in \.compressed\.ply, \.ply, \.spz, \.sog, \.glb, \.splat$",
+            match=rf"{name}: expected .* ends in {re.escape(known_suffixes())}$",
         ):
             write(tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog", ".compressed.ply", ".glb", ".splat"])
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_every_format_round_trips(tmp_path: Path, suffix: str) -> None:
     model = random_gaussians(40, sh_degree=1)
     path = tmp_path / f"a{suffix}"
@@ -55,7 +66,7 @@ def test_every_format_round_trips(tmp_path: Path, suffix: str) -> None:
         assert read_model(path).digest() == read_model(path.rename(tmp_path / "download")).digest()
 
 
-@pytest.mark.parametrize("suffix", [".spz", ".sog", ".compressed.ply", ".glb", ".splat"])
+@pytest.mark.parametrize("suffix", [suffix for suffix in SUFFIXES if suffix != ".ply"])
 def test_invalid_models_are_not_written(tmp_path: Path, suffix: str) -> None:
     model = random_gaussians(40)
     with pytest.raises(OutputError, match="holds no Gaussians"):

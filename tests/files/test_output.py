@@ -51,7 +51,7 @@ def test_files_are_private(tmp_path: Path, umask: None) -> None:
     assert (tmp_path / "x").stat().st_mode & 0o777 == 0o600
 
 
-def test_leftovers_of_killed_processes_are_removed(tmp_path: Path) -> None:
+def test_leftovers_are_removed(tmp_path: Path) -> None:
     with child(WRITE_AND_WAIT, tmp_path / "x"):
         pass
     assert sorted(path.name for path in tmp_path.iterdir()) == [".x.lock", ".x.unfinished"]
@@ -68,7 +68,7 @@ def test_concurrent_writes_are_refused(tmp_path: Path) -> None:
         write_bytes(tmp_path / "x", b"1")
 
 
-def test_links_at_the_temporary_path_are_not_followed(tmp_path: Path) -> None:
+def test_temporary_links_are_not_followed(tmp_path: Path) -> None:
     victim, temporary = tmp_path / "victim", tmp_path / ".x.unfinished"
     victim.write_bytes(b"mine")
     for link in (temporary.symlink_to, temporary.hardlink_to):

@@ -16,7 +16,8 @@ from keyss.core import Gaussians, InputError, KeyssWarning
 from keyss.files import read_model, write_model
 from keyss.files.models import reads_as
 from keyss.files.ply_table import LEAST_LOG_SCALE
-from keyss.runs.describe import ModelInfo, info
+from keyss.runs import ModelInfo
+from keyss.runs.describe import info
 from tiny_scenes import random_gaussians
 
 Transform = Callable[..., Path]

@@ -35,7 +35,7 @@ def damaged(path: Path, seed: int, count: int = 9000, kind: str = "float") -> No
 
 @pytest.mark.parametrize("kind", ["float", "two types"])
 @pytest.mark.parametrize("seed", range(12))
-def test_the_summary_is_that_of_the_model(tmp_path: Path, seed: int, kind: str) -> None:
+def test_summary_matches_model(tmp_path: Path, seed: int, kind: str) -> None:
     path = tmp_path / "a.ply"
     damaged(path, seed, kind=kind)
     with warnings.catch_warnings(record=True) as of_model:
@@ -52,7 +52,7 @@ def test_the_summary_is_that_of_the_model(tmp_path: Path, seed: int, kind: str) 
     assert summary.nearly_transparent == int((model.opacity_logits < NEARLY_TRANSPARENT).sum())
 
 
-def test_activated_models_are_refused_as_by_the_reader(tmp_path: Path) -> None:
+def test_activated_models_are_refused(tmp_path: Path) -> None:
     model = model_of(2000, 1)
     write_model(
         tmp_path / "a.ply", type(model)(model.means, model.quats, model.scales, model.opacities, model.sh)

@@ -11,7 +11,8 @@ from files.scene_files import write_colmap
 from keyss.core import InputError, KeyssWarning
 from keyss.files import load_scene, read_model, write_model
 from keyss.rendering.orbit import is_model
-from keyss.runs.describe import ModelInfo, info
+from keyss.runs import ModelInfo
+from keyss.runs.describe import info
 from keyss.viewer import export_html
 from tiny_scenes import random_gaussians
 

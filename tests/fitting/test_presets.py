@@ -7,7 +7,8 @@ import torch
 
 import keyss
 from keyss.core import UsageError
-from keyss.fitting.config import PRESETS, FitConfig, preset_for
+from keyss.fitting import PRESETS, FitConfig
+from keyss.fitting.config import preset_for
 from keyss.methods import registry
 
 
@@ -24,7 +25,7 @@ def test_presets_of_a_gpu_are_those_of_3dgs() -> None:
 
 
 @pytest.mark.parametrize("name", registry.METHODS)
-def test_methods_take_the_preset_of_the_device(name: str) -> None:
+def test_methods_take_preset_of_device(name: str) -> None:
     options = registry.options_of(name)
     assert options.preset("default", "cuda").fit == preset_for("default", "cuda")
     assert options.preset("default").fit == FitConfig()
@@ -34,7 +35,7 @@ class Reached(Exception):
     pass
 
 
-def test_without_a_config_a_fit_has_the_preset_of_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fit_takes_preset_of_device(monkeypatch: pytest.MonkeyPatch) -> None:
     configs = []
 
     def seen(config: FitConfig, *_: object) -> None:

@@ -53,13 +53,13 @@ def _rotation(up: list[float]) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("distance", [6.0, 12.0, 100.0])
-def test_fog_is_not_the_subject(distance: float) -> None:
+def test_fog_is_ignored(distance: float) -> None:
     alone, surrounded = frame_of(subject()), frame_of(Gaussians.cat([subject(), fog(distance=distance)]))
     assert np.linalg.norm(surrounded.middle - alone.middle) < 0.1
     assert 0.5 < surrounded.radius / alone.radius < 1.5
 
 
-def test_what_is_as_fine_belongs_to_the_subject() -> None:
+def test_long_subject_is_whole() -> None:
     """A long object is not cut where most of its Gaussians are."""
     neck = subject(600, 3)
     neck = replace(
@@ -70,12 +70,12 @@ def test_what_is_as_fine_belongs_to_the_subject() -> None:
 
 
 @pytest.mark.parametrize("name", FLOORS)
-def test_up_is_the_floor_s_normal(name: str) -> None:
+def test_up_is_floor_normal(name: str) -> None:
     up = np.array(FLOORS[name]) / np.linalg.norm(FLOORS[name])
     assert frame_of(on_a_floor(FLOORS[name])).up @ up > np.cos(np.radians(6))
 
 
-def test_without_a_floor_up_is_that_of_captures() -> None:
+def test_up_without_floor() -> None:
     assert frame_of(subject()).up.tolist() == [0, -1, 0]
 
 

@@ -50,10 +50,10 @@ def test_unsafe_cache_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_cache_folder_is_recreated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = tmp_path / "cache"
-    folder.mkdir()
-    monkeypatch.setattr(jit, "cache_folder", lambda: folder)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    jit.cache_folder.cache_clear()
     compiled = jit.kernel(add_one)
+    (folder,) = tmp_path.iterdir()
     shutil.rmtree(folder)
     assert compiled(np.float32(1)) == 2
     assert list(folder.rglob("*.nbi"))

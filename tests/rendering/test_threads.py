@@ -128,7 +128,7 @@ def test_spinning_threads_warning(monkeypatch: pytest.MonkeyPatch) -> None:
         fit(tiny_scene(0), config=FitConfig(iterations=1, max_gaussians=50, seed=0))
 
 
-def test_blocks_stop_soon_after_an_interruption() -> None:
+def test_blocks_stop_after_interrupt() -> None:
     torch.set_num_threads(4)
     interrupted, begun = threading.Event(), []
 

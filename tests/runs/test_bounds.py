@@ -6,44 +6,41 @@ from dataclasses import replace
 from pathlib import Path
 
 import msgspec
-import pytest
 
 import keyss
 from keyss import CarryOptions, FitConfig, Secret
-from keyss.fitting import PlainRun
+from keyss.progress import Reporter
 
 FIT = FitConfig(iterations=40, max_gaussians=300, grow_every=20, evaluate_every=0, seed=0)
 KEY = "a key of many characters: 93hXmQ2"
 
 
-def count_steps(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
-    """Count the steps of each plain training."""
-    counts: dict[str, int] = {}
-    step, begin = PlainRun.step, PlainRun.__init__
+class Trainings(Reporter):
+    """Records the steps of each training."""
 
-    def named(self: PlainRun, scene: keyss.Scene, *arguments: object) -> None:
-        begin(self, scene, *arguments)  # type: ignore[arg-type]
-        self.label = f"{scene.name} {len(counts)}"  # type: ignore[attr-defined]
-        counts[self.label] = 0  # type: ignore[attr-defined]
+    def __init__(self) -> None:
+        self.steps: list[int] = []
 
-    def counted(self: PlainRun) -> None:
-        counts[self.label] += 1  # type: ignore[attr-defined]
-        step(self)
+    def start(self, title: str, iterations: int, iteration: int) -> None:
+        self.steps.append(0)
 
-    monkeypatch.setattr(PlainRun, "__init__", named)
-    monkeypatch.setattr(PlainRun, "step", counted)
-    return counts
+    def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
+        self.steps[-1] = iteration
 
 
-def test_bound_has_equal_steps(
-    folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    counts = count_steps(monkeypatch)
+def test_bound_has_equal_steps(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    trainings = Trainings()
     options = CarryOptions(fit=FIT, publish="converted", fine_tune="always", iterations=30)
     result = keyss.hide(
-        folders[0], [Secret(folders[1], KEY)], method=options, bound=True, min_psnr=0, out=tmp_path / "run"
+        folders[0],
+        [Secret(folders[1], KEY)],
+        method=options,
+        bound=True,
+        min_psnr=0,
+        out=tmp_path / "run",
+        reporter=trainings,
     )
-    steps = list(counts.values())
+    steps = trainings.steps
     assert steps == [40, 40, 30, 70]  # cover, secret, fine-tuning of the secret, bound
     metrics = result.metrics
     assert metrics.steps == metrics.baseline.steps == (steps[0], steps[1] + steps[2]) == (40, steps[3])
@@ -55,15 +52,13 @@ def test_bound_has_equal_steps(
     assert metrics.baseline.gaussians[1] == len(longer)
 
 
-def test_shorter_fit_is_no_bound(
-    folders: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    counts = count_steps(monkeypatch)
+def test_shorter_fit_is_no_bound(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    trainings = Trainings()
     fitted = keyss.fit(folders[1], config=replace(FIT, iterations=25), out=tmp_path / "plain")
     secret = Secret(folders[1], KEY, tmp_path / "plain" / "model.ply")
     options = CarryOptions(fit=FIT, publish="converted", fine_tune="always")
-    metrics = keyss.hide(folders[0], [secret], method=options, min_psnr=0).metrics
-    assert list(counts.values()) == [25, 40, 46]
+    metrics = keyss.hide(folders[0], [secret], method=options, min_psnr=0, reporter=trainings).metrics
+    assert trainings.steps == [40, 46]
     assert metrics.steps == (40, 71)  # recorded by `keyss fit`
     assert metrics.baseline.steps == (40, 25)
     assert metrics.baseline.equal == (True, False)

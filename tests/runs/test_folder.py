@@ -70,7 +70,7 @@ def test_failed_write_leaves_nothing(tmp_path: Path, there: bool) -> None:
 
 def test_overwrite(tmp_path: Path) -> None:
     write_run(tmp_path, files={"publish/model.ply": b"1", "publish/model.spz": b"2", "private/old/x": b"3"})
-    write_run(tmp_path, "audit", {"private/report.html": b"4"}, onto=("hide",))
+    write_run(tmp_path, "audit", {"private/report.md": b"4"}, onto=("hide",))
     foreign = {
         "notes.txt": b"mine",
         "checkpoint/x": b"my own",

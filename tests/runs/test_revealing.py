@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from keyss.core import Gaussians
-from keyss.methods.hidden import Recovered
+from keyss.methods import Recovered
 from keyss.runs.revealing import Revealed, check_model, check_secret, loss_warnings
 from tiny_scenes import random_gaussians
 

@@ -35,15 +35,14 @@ from channels.lsb.trained_like import trained_like  # noqa: E402
 from files.formats.examples import model_of, random_compressed, random_sog, random_spz  # noqa: E402
 from keyss.channels import LOW_BITS, SUFFIXES, Payload, channel_for, in_counted_order, last_bits, open_payload  # noqa: E402
 from keyss.channels.lsb.fields import _log2  # noqa: E402
-from keyss.core.gaussians import Gaussians  # noqa: E402
-from keyss.core.similarity import Similarity  # noqa: E402
+from keyss.core import Gaussians, Similarity  # noqa: E402
 from keyss.files import read_model, write_model  # noqa: E402
 from keyss.files.formats import splat  # noqa: E402
 from keyss.files.formats.common import CodedGaussians  # noqa: E402
 from keyss.files.formats.compressed_ply import CompressedPlyCodes  # noqa: E402
 from keyss.files.formats.sog import SogCodes  # noqa: E402
 from keyss.files.formats.spz import SpzCodes  # noqa: E402
-from keyss.keys.derivation import random_embeddings  # noqa: E402
+from keyss.keys import random_embeddings  # noqa: E402
 from keyss.methods import CarriedSecret, Decoder, DecoderShape, HiddenFile, KeyssSecret, choose_anchors  # noqa: E402
 from keyss.methods.codec.model_bytes import BLOCK, decode, encode  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402

@@ -15,9 +15,7 @@ from scipy.spatial.transform import Rotation
 from channels.lsb.trained_like import trained_like
 from keyss.channels import APPENDED, COLOURS, Payload
 from keyss.channels.colours import planner
-from keyss.core.errors import KeyssWarning
-from keyss.core.gaussians import Gaussians
-from keyss.core.similarity import Similarity
+from keyss.core import Gaussians, KeyssWarning, Similarity
 from keyss.files import write_model
 from keyss.methods import HiddenFile
 from keyss.methods.codec.model_bytes import encode

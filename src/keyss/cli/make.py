@@ -27,6 +27,7 @@ from keyss.cli.arguments import (
 )
 from keyss.cli.keys import given_keys, key_of_file
 from keyss.core.errors import UsageError
+from keyss.files.model_formats import known_suffixes
 
 ENOUGH_BITS = 64  # of a random key, which Argon2id makes as slow to find as 2^80 plain hashes
 
@@ -164,7 +165,7 @@ def keygen(
 
 def convert(
     model: Annotated[Positional[Path], arg(metavar="IN", help="Model of any format, or - for stdin.")],
-    out: Annotated[Positional[Path], arg(metavar="OUT", help="Model to write (.ply, .spz, .sog, ...).")],
+    out: Annotated[Positional[Path], arg(metavar="OUT", help=f"Model to write ({known_suffixes()}).")],
     *,
     key_file: KeyFilesToCheck = (),
     force: Annotated[bool, switch("Write the model even if a secret is lost.")] = False,
@@ -174,9 +175,8 @@ def convert(
 ) -> None:
     """Convert a model to another format, and report the cost.
 
-    The suffix of OUT selects the format: .ply, .compressed.ply, .spz, .sog, .glb or .splat. All formats
-    but .ply round values, which destroys what is hidden in low bits, and most reorder Gaussians. The cost
-    is the PSNR between renders before and after.
+    The suffix of OUT selects the format. All formats but .ply round values, which destroys what is hidden in
+    low bits, and most reorder Gaussians. The cost is the PSNR between renders before and after.
 
     example: keyss convert cover.ply cover.spz
 

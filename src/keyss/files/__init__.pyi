@@ -5,8 +5,12 @@ from .atomic import (
     write_bytes as write_bytes,
 )
 from .file_kinds import identify_file as identify_file
-from .models import (
+from .model_formats import (
     DECODED_SUFFIX as DECODED_SUFFIX,
+    FORMATS as FORMATS,
+    known_suffixes as known_suffixes,
+)
+from .models import (
     check_model_output as check_model_output,
     is_model_path as is_model_path,
     keeps_low_bits as keeps_low_bits,

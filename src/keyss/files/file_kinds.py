@@ -16,6 +16,7 @@ from pathlib import Path
 
 from keyss.core.errors import BackendError, InputError, KeyssWarning
 from keyss.files.inputs import open_input
+from keyss.files.model_formats import FORMATS
 
 CONVERT = "convert it to .ply first, e.g. with `splat-transform IN OUT.ply`"
 _MODEL = "give it where a model is asked for"
@@ -61,10 +62,11 @@ class _Kind:
 
 # The first matching suffix wins, else the first matching content.
 _KINDS = (
-    _Kind("an SPZ model", _MODEL, (".spz",), (b"NGSP",)),
-    _Kind("an SOG model", _MODEL, (".sog",)),
-    _Kind("a .splat model", _MODEL, (".splat",)),
-    _Kind("a glTF file", _MODEL, (".glb",), (b"glTF",)),
+    *(
+        _Kind(entry.kind, _MODEL, entry.suffixes, entry.magic)
+        for entry in FORMATS
+        if entry.magic != (b"ply",)
+    ),
     _Kind("a .ksplat model", CONVERT, (".ksplat",)),
     _Kind("an LCC model", CONVERT, (".lcc", ".lcc2")),
     _Kind("a glTF file with its data beside it", "export a .glb from the program that made it", (".gltf",)),
@@ -170,16 +172,16 @@ def model_file(path: Path | str) -> Path:
 
 def identify_folder(folder: Path) -> str | None:
     """`identify_file` for a folder that is neither a scene nor a model; None if unknown."""
-    if any(True for each in _CHECKPOINTS for _ in folder.glob(each)):
+    if any(True for pattern in _CHECKPOINTS for _ in folder.glob(pattern)):
         return f"a folder of checkpoints of a training; {_CHECKPOINT}"
     return None
 
 
 def _latest_model(folder: Path) -> Path | None:
-    if not os.path.isdir(folder) or any(os.path.lexists(folder / each) for each in _OTHERS):
+    if not os.path.isdir(folder) or any(os.path.lexists(folder / other) for other in _OTHERS):
         return None
     for pattern in _MODELS:
-        models = {str(each.relative_to(folder)): each for each in folder.glob(pattern) if each.is_file()}
+        models = {str(path.relative_to(folder)): path for path in folder.glob(pattern) if path.is_file()}
         if models:
             return models[max(models, key=lambda name: [int(step) for step in re.findall(r"[0-9]+", name)])]
     return None

@@ -6,9 +6,8 @@ import io
 import os
 import pkgutil
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -35,58 +34,21 @@ from keyss.files.inputs import (
     read_standard_input,
     write_standard_output,
 )
+from keyss.files.model_formats import (
+    DECODED,
+    DECODED_SUFFIX,
+    FORMATS,
+    PLY,
+    ModelFormat,
+    format_of,
+    known_suffixes,
+)
 from keyss.files.ply_table import is_plain
-
-DECODED_SUFFIX = ".3dgs.safetensors"  # models with a decoder network
-
-
-@dataclass(frozen=True)
-class ModelFormat:
-    """One file format of 3DGS models."""
-
-    name: str
-    suffixes: tuple[str, ...]  # lower case, with the dot; the first is preferred
-    magic: tuple[bytes, ...]  # possible first bytes; empty: identified by suffix
-    codec: str  # module or class of `formats/` with `read(data)` and `write(model)`, imported at first use
-    is_exact: bool = False  # keeps every bit
-
-    def read(self, file: BinaryIO) -> Gaussians:
-        """The model in an open file, on the CPU. Raises InputError."""
-        if self.magic == (b"ply",) and is_plain(file):
-            return ply.read(file)
-        data = file.read(MAX_BYTES + 1)
-        if len(data) > MAX_BYTES:
-            raise InputError(f"expected at most {MAX_BYTES:,} bytes, found more")
-        with np.errstate(all="ignore"):  # values that are not finite are reported at the end
-            model: Gaussians = pkgutil.resolve_name(f"keyss.files.formats.{self.codec}").read(data)
-        return model
-
-    def write(self, model: Gaussians, file: BinaryIO) -> None:
-        """Write a model to an open file. Raises OutputError."""
-        if self is _PLY:
-            ply.write(model, file)
-        else:
-            file.write(pkgutil.resolve_name(f"keyss.files.formats.{self.codec}").write(model))
-
-
-_PACKED = "compressed_ply:CompressedPlyCodes"
-_PLY = ModelFormat("PLY", (".ply",), (b"ply",), _PACKED, is_exact=True)  # plain, which `ply` reads, or packed
-# A file name belongs to the first format with a matching suffix.
-FORMATS = [
-    ModelFormat("compressed PLY", (".compressed.ply",), (b"ply",), _PACKED),
-    _PLY,
-    ModelFormat("SPZ", (".spz",), (b"NGSP", b"\x1f\x8b"), "spz:SpzCodes"),
-    ModelFormat("SOG", (".sog",), (b"PK\x03\x04",), "sog:SogCodes"),
-    ModelFormat("glTF", (".glb",), (b"glTF",), "glb"),
-    ModelFormat(".splat", (".splat",), (), "splat"),
-]
-# Not a format of 3DGS models, so messages do not list it.
-_DECODED = ModelFormat("decoded", (DECODED_SUFFIX,), (), "decoded_models", is_exact=True)
 
 
 def is_model_path(path: Path | str) -> bool:
     """True if a path has the suffix of a model format."""
-    return _by_suffix(path) is not None
+    return format_of(path) is not None
 
 
 def is_model_source(path: Path | str) -> bool:
@@ -182,38 +144,31 @@ def check_model_output(path: Path | str, overwrite: bool, inputs: Sequence[Path]
     return check_output_file(path, overwrite)
 
 
-def known_suffixes() -> str:
-    """The suffixes of all formats, for messages."""
-    return ", ".join(suffix for each in FORMATS for suffix in each.suffixes)
-
-
-def _by_suffix(path: Path | str) -> ModelFormat | None:
-    name = Path(path).name.lower()
-    return next((each for each in (*FORMATS, _DECODED) if name.endswith(each.suffixes)), None)
-
-
 def _for_writing(path: Path | str) -> ModelFormat:
     """The format of the suffix. Raises UsageError if it is unknown."""
-    found = _PLY if is_standard(path) else _by_suffix(path)
-    if found is None:
+    model_format = PLY if is_standard(path) else format_of(path)
+    if model_format is None:
         raise UsageError(f"cannot write a model as {path}: expected a name that ends in {known_suffixes()}")
-    return found
+    return model_format
 
 
 def _write(file: BinaryIO, path: Path | str, model: Gaussians) -> None:
-    found = _for_writing(path)
-    if isinstance(model, DecodedGaussians) and found is not _DECODED:
+    model_format = _for_writing(path)
+    if isinstance(model, DecodedGaussians) and model_format is not DECODED:
         raise UsageError(
             f"cannot write {path}: a network decodes what this model renders, which 3DGS files cannot hold; "
             f"use a name that ends in {DECODED_SUFFIX}, which `keyss render` reads"
         )
-    if found is _DECODED and not isinstance(model, DecodedGaussians):
+    if model_format is DECODED and not isinstance(model, DecodedGaussians):
         raise UsageError(
             f"cannot write a 3DGS model as {path}: {DECODED_SUFFIX} is for models that a network decodes; "
             "use a name that ends in .ply"
         )
     try:
-        found.write(model, file)
+        if model_format is PLY:
+            ply.write(model, file)
+        else:
+            file.write(_codec(model_format).write(model))
     except OutputError as error:
         raise OutputError(f"cannot write {path}: {error}") from error
 
@@ -222,19 +177,32 @@ def _read(file: BinaryIO, name: str) -> Gaussians:
     """The model in an open file, in the format of its first bytes, which must not contradict `name`."""
     start = file.read(START_BYTES)
     file.seek(0)
-    fitting = [each for each in FORMATS if each.magic and start.startswith(each.magic)]
-    if is_foreign_archive(start):
-        fitting = []
-    named = _by_suffix(name)
-    if named in fitting or (named and start and not named.magic and not fitting):
-        return named.read(file)
+    fitting = [] if is_foreign_archive(start) else [entry for entry in FORMATS if entry.starts(start)]
+    named = format_of(name)
+    if named in fitting or (named and start and not fitting and not (named.magic or named.archive)):
+        return _read_as(named, file)
     if not fitting:
         kind = identify_content("" if named else name, start)  # the content refutes the name of a model
         raise InputError(f"expected a 3DGS model ({known_suffixes()}), found {kind}")
-    found = fitting[-1]
     if named is not None:
         raise InputError(
-            f"the name says {named.name}, but the content is {found.name}; "
-            f"rename it to end in {found.suffixes[0]}"
+            f"the name says {named.name}, but the content is {fitting[-1].name}; "
+            f"rename it to end in {fitting[-1].suffixes[0]}"
         )
-    return found.read(file)
+    return _read_as(fitting[-1], file)
+
+
+def _read_as(model_format: ModelFormat, file: BinaryIO) -> Gaussians:
+    """The model in an open file, on the CPU. Raises InputError."""
+    if model_format.magic == (b"ply",) and is_plain(file):
+        return ply.read(file)
+    data = file.read(MAX_BYTES + 1)
+    if len(data) > MAX_BYTES:
+        raise InputError(f"expected at most {MAX_BYTES:,} bytes, found more")
+    with np.errstate(all="ignore"):  # values that are not finite are reported at the end
+        model: Gaussians = _codec(model_format).read(data)
+    return model
+
+
+def _codec(model_format: ModelFormat) -> Any:
+    return pkgutil.resolve_name(f"keyss.files.formats.{model_format.codec}")

@@ -75,7 +75,7 @@ def _mix(state: Any, a: Any, b: Any, c: Any, d: Any, x: Any, y: Any) -> None:
 
 
 @kernel
-def _hash(rows: Any, start: Any, found: Any) -> None:
+def _hash(rows: Any, start: Any, hashes: Any) -> None:
     size = 4 * rows.shape[1]
     block, state, chain = np.empty(16, np.uint64), np.empty(16, np.uint64), np.empty(8, np.uint64)
     for row in range(len(rows)):
@@ -102,4 +102,4 @@ def _hash(rows: Any, start: Any, found: Any) -> None:
                     _mix(state, pair, 4 + (pair + 1) % 4, 8 + (pair + 2) % 4, 12 + (pair + 3) % 4, x, y)
             for word in range(8):
                 chain[word] ^= state[word] ^ state[8 + word]
-        found[row] = chain[: found.shape[1]]
+        hashes[row] = chain[: hashes.shape[1]]

@@ -1,5 +1,4 @@
 from .auc import Auc as Auc, auc_between as auc_between
-from .audits.parts import RenderTime as RenderTime, measure_render_time as measure_render_time
 from .baselines.baseline_options import BaselineOptions as BaselineOptions
 from .distances import (
     against_controls as against_controls,
@@ -20,6 +19,7 @@ from .leaks.leak_scores import (
     leak_scores as leak_scores,
     look_for_secret as look_for_secret,
 )
+from .render_time import RenderTime as RenderTime, measure_render_time as measure_render_time
 from .robustness.changes import (
     Change as Change,
     cropping as cropping,

@@ -59,13 +59,13 @@ def against_controls(
 
     stego = mean((control, model) for control in controls)
     between = mean(combinations(controls, 2))
-    own = None if original is None else mean((control, original) for control in controls)
+    plain = None if original is None else mean((control, original) for control in controls)
     return {
         name: AttributeDistance(
             stego[name],
             control,
             ratio=stego[name] / control if control else None,
-            original=own[name] / control if own and control else None,
+            original=plain[name] / control if plain and control else None,
         )
         for name, control in between.items()
     }

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import astuple
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -26,10 +26,8 @@ from keyss.cli.arguments import (
 )
 
 if TYPE_CHECKING:
-    from keyss.lab.audits import Audit
     from keyss.lab.many import Forecast
 
-PartName = Literal["images", "parameters", "stealth", "stegexpose", "leaks", "robustness", "speed"]
 TableName = Literal["single", "multi", "masks", "combined", "pruning", "sinkhorn", "speed"]
 QUICK = {"iterations": 500, "max_gaussians": 3000, "width": 100}
 Seeds = Annotated[
@@ -47,10 +45,9 @@ def audit(
         int, arg(metavar="N", help="Plain models of the cover from other seeds, as controls; at least 2.")
     ] = 3,
     only: Annotated[
-        UseAppendAction[tuple[PartName, ...]],
-        optional("PART", f"Part to audit: {', '.join(get_args(PartName))}; repeat for more.", "all"),
+        UseAppendAction[tuple[str, ...]],
+        optional("PART", "Part to audit, of those that --dry-run lists; repeat for more.", "all"),
     ] = (),
-    report_only: Annotated[bool, switch("Write the report again, from the stored measurements.")] = False,
     dry_run: Annotated[bool, switch("Print estimates of the time of each part; needs no keys.")] = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
@@ -61,23 +58,29 @@ def audit(
 
     example: keyss audit runs/hidden --key-file key.txt
 
-    example: keyss audit runs/hidden --report-only
-
     example: keyss audit runs/hidden --dry-run
+
+    example: keyss audit runs/hidden --key-file key.txt --only stealth --only leaks
     """
     check_exists(run)
     measure = verb("audit")
-    if dry_run:
-        _print_audit_forecast(run, controls, only, device)
-        return
     from keyss import progress
     from keyss.cli.keys import keys_of_run
-    from keyss.cli.tables import print_files
+    from keyss.cli.tables import Console, print_files, print_table
 
-    found = measure(
+    if dry_run:
+        from keyss.lab.audits.audit_run import forecast_audit
+
+        seconds = forecast_audit(run, controls=controls, only=only, device=device)
+        print_table(("part", "time, about"), [(name, progress.about(each)) for name, each in seconds.items()])
+        print(f"About {progress.about(sum(seconds.values()))}; controls that exist take no time.")
+        print("Dry run: nothing was written. Times are rough.")
+        return
+    from keyss.lab.audits import headline
+
+    result = measure(
         run,
-        () if report_only else keys_of_run(run, key_file),
-        report_only=report_only,
+        keys_of_run(run, key_file),
         controls=controls,
         only=only,
         seed=check_seed(seed),
@@ -87,11 +90,13 @@ def audit(
         reporter=progress.reporter(),
     )
     if progress.level >= 0:
-        _print_verdicts(found)
+        rows = [astuple(verdict) for verdict in result.verdicts]
+        print_table(("measure", "measured", "baseline or control", "limit", "verdict"), rows, texts=5)
+        Console().print(headline(result.verdicts), highlight=False)
     print_files(
         run,
         {
-            "private/report.html": "the report: look here first; it shows the secret",
+            "private/report.md": "the report: look here first; it shows the secret",
             "private/audit/audit.json": "the measurements",
         },
     )
@@ -281,10 +286,10 @@ def sweep(
         "private/master-key.txt": "the key from which those of the trials are derived",
     }
     print_files(out, described)
-    failed = [each for each in outcomes if each.error]
+    failed = [outcome for outcome in outcomes if outcome.error]
     progress.say(f"{len(outcomes) - len(failed)} of {len(outcomes)} trials are done")
-    for each in failed:
-        print(f"failed: {each.name}: {each.error}")
+    for outcome in failed:
+        print(f"failed: {outcome.name}: {outcome.error}")
     if failed:
         raise InputError(f"{len(failed)} of {len(outcomes)} trials failed")
 
@@ -295,46 +300,22 @@ def _scene_tables(stem: str) -> dict[str, str]:
     return {f"{stem}.csv": scenes, f"{stem}.tex": "the same, for LaTeX (booktabs)"}
 
 
-def _print_verdicts(audit: Audit) -> None:
-    """Print the verdicts of an audit: a line per measure, with its baseline or control."""
-    from keyss.cli.tables import Console, print_table
-    from keyss.lab.audits import headline, verdicts
-
-    lines = verdicts(audit)
-    rows = [(line.measure, line.value, line.beside, line.limit, line.word) for line in lines]
-    print_table(("measure", "measured", "baseline or control", "limit", "verdict"), rows, texts=5)
-    Console().print(headline(lines), highlight=False)
-
-
-def _print_audit_forecast(run: Path, controls: int, only: Sequence[str], device: Device) -> None:
-    """Print the parts of an audit and how long they take."""
-    from keyss.cli.tables import print_table
-    from keyss.lab.audits.forecast import forecast_audit
-    from keyss.progress import about
-
-    found = forecast_audit(run, controls=controls, only=only, device=device)
-    print_table(("part", "time, about"), [(name, about(each)) for name, each in found.seconds.items()])
-    where = "the GPU" if found.device == "cuda" else "the CPU"
-    print(f"About {about(sum(found.seconds.values()))} on {where}.")
-    print("Dry run: nothing was written. Times are rough; controls that exist take none.")
-
-
-def _print_forecast(found: Forecast) -> None:
+def _print_forecast(forecast: Forecast) -> None:
     """Print the trials of a dry run, with estimates for those to do."""
     from keyss.cli.tables import print_table
     from keyss.progress import about
 
     rows = []
-    for place, name in found.names.items():
-        time, memory = "cannot work" if place in found.refused else "done", ""
-        if (cost := found.costs.get(place)) is not None:
+    for place, name in forecast.names.items():
+        time, memory = "cannot work" if place in forecast.refused else "done", ""
+        if (cost := forecast.costs.get(place)) is not None:
             time, memory = about(cost.seconds), f"{cost.memory_bytes / 1e9:.1f} GB"
         rows.append((name, time, memory))
     print_table(("run", "time, about", "memory"), rows)
-    for place, reason in found.refused.items():
-        print(f"{found.names[place]}: {reason}")
+    for place, reason in forecast.refused.items():
+        print(f"{forecast.names[place]}: {reason}")
     print(
-        f"{len(rows)} run{'s' * (len(rows) != 1)}, {len(found.costs)} to do: about "
-        f"{about(sum(cost.seconds for cost in found.costs.values()))} on this machine."
+        f"{len(rows)} run{'s' * (len(rows) != 1)}, {len(forecast.costs)} to do: about "
+        f"{about(sum(cost.seconds for cost in forecast.costs.values()))} on this machine."
     )
     print("Dry run: nothing was written. Times are rough; measurements are included.")

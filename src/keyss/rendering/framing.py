@@ -76,7 +76,7 @@ def _densest(means: Doubles, weights: Doubles) -> tuple[Doubles, float]:
     """Middle and radius of the sphere with the largest weight / radius^_GROWTH."""
     middle = _middle(means, weights)
     radius = max(_quantile(_distances(means, middle), weights, 0.995), 1e-6) / _SHRINK
-    best, found = -1.0, (middle, radius)
+    best, sphere = -1.0, (middle, radius)
     for _ in range(_STEPS):
         radius *= _SHRINK
         inside = _distances(means, middle) < radius
@@ -86,8 +86,8 @@ def _densest(means: Doubles, weights: Doubles) -> tuple[Doubles, float]:
         inside = _distances(means, middle) < radius
         score = weights[inside].sum() / radius**_GROWTH
         if score > best:
-            best, found = score, (middle, radius)
-    return found
+            best, sphere = score, (middle, radius)
+    return sphere
 
 
 def _up(offsets: Doubles, normals: Doubles, areas: Doubles) -> Doubles:
@@ -132,10 +132,10 @@ def _cap(axis: Doubles, degrees: float, count: int) -> Doubles:
     side /= np.linalg.norm(side)
     across = np.sqrt(1 - along**2)[:, None]
     other = np.cross(axis, side)
-    found: Doubles = along[:, None] * axis + across * (
+    directions: Doubles = along[:, None] * axis + across * (
         np.cos(turns)[:, None] * side + np.sin(turns)[:, None] * other
     )
-    return found
+    return directions
 
 
 def _normals(quats: Doubles, shortest: npt.NDArray[np.int64]) -> Doubles:
@@ -148,8 +148,8 @@ def _normals(quats: Doubles, shortest: npt.NDArray[np.int64]) -> Doubles:
             [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    found: Doubles = columns[shortest, :, np.arange(len(quats))]
-    return found
+    axes: Doubles = columns[shortest, :, np.arange(len(quats))]
+    return axes
 
 
 def _middle(means: Doubles, weights: Doubles) -> Doubles:
@@ -167,5 +167,5 @@ def _quantile(values: Doubles, weights: Doubles, share: float) -> float:
 
 
 def _distances(means: Doubles, middle: Doubles) -> Doubles:
-    found: Doubles = np.linalg.norm(means - middle, axis=1)
-    return found
+    distances: Doubles = np.linalg.norm(means - middle, axis=1)
+    return distances

@@ -162,7 +162,8 @@ def _model_info(path: Path, capacity: bool = False) -> ModelInfo:
 
 
 def _read_model(path: Path) -> Gaussians:
-    from keyss.files.models import is_model_source, known_suffixes, read_model
+    from keyss.files.model_formats import known_suffixes
+    from keyss.files.models import is_model_source, read_model
 
     if not (is_standard(path) or is_model_source(path)):
         raise InputError(

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from keyss.core.errors import InputError, KeyssWarning
 from keyss.files.file_kinds import model_file
+from keyss.files.model_formats import PLY, format_of
 from keyss.files.ply_table import is_plain, read_vertices
 
 _BYTES = 16  # of a Gaussian in a compressed file
@@ -25,24 +26,18 @@ _SECONDS = {
     "export": 1.0,
     "render": 10.0,
     "prepare": 7.0,
-    ".compressed.ply": 9.0,  # before its own end
-    ".ply": 3.0,
-    ".spz": 13.0,
-    ".sog": 9.0,
-    ".glb": 5.0,
-    ".splat": 3.0,
 }
 
 
 def seconds_for(task: str, model: Path) -> float:
-    """About the seconds that a task takes: one of `_SECONDS`, where suffixes are formats to write."""
+    """About the seconds that a task takes, one of `_SECONDS`."""
     return _START + _SECONDS[task] * gaussians_in(model) / 1e6
 
 
 def seconds_to_convert(model: Path, out: Path, keys: int) -> float:
     """About the seconds to convert a model and to open its secrets before and after."""
-    suffix = next((name for name in _SECONDS if name.startswith(".") and out.name.endswith(name)), ".ply")
-    return seconds_for(suffix, model) + 2 * keys * (seconds_for("reveal", model) - _START)
+    per_million = (format_of(out) or PLY).write_seconds + 2 * keys * _SECONDS["reveal"]
+    return _START + per_million * gaussians_in(model) / 1e6
 
 
 def seconds_to_prepare(sources: Sequence[object]) -> float:

@@ -11,14 +11,15 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.picture_network import DecodedGaussians
 from keyss.core.scene import Scene, ViewOptions
 from keyss.files.file_kinds import identify_file
-from keyss.files.models import DECODED_SUFFIX, is_model_source, known_suffixes, read_model
+from keyss.files.model_formats import DECODED_SUFFIX, known_suffixes
+from keyss.files.models import is_model_source, read_model
 from keyss.methods.companion import SUFFIX
 from keyss.runs.folder import PRIVATE, PUBLISH
 
 STEGO = f"{PUBLISH}/model.ply"  # an innocuous name
 STEGOS = (STEGO, *(f"{PUBLISH}/model{suffix}" for suffix in (*SUFFIXES.values(), DECODED_SUFFIX)))
 MODEL = "model.ply"  # result of a plain fit
-CONFIG, METRICS, REPORT = f"{PRIVATE}/config.json", f"{PRIVATE}/metrics.json", f"{PRIVATE}/report.html"
+CONFIG, METRICS, REPORT = f"{PRIVATE}/config.json", f"{PRIVATE}/metrics.json", f"{PRIVATE}/report.md"
 LOOK = f"{PRIVATE}/look.png"  # test views before and after
 COMPANIONS = f"{PRIVATE}/companion"  # companion files, for those who may see a secret
 CONTROLS = f"{PRIVATE}/controls"  # plain models of the cover from other seeds, for audits

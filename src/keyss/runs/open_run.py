@@ -71,17 +71,26 @@ class HidingRun:
         ]
 
 
+def read_run(run: Path) -> tuple[Path, RunConfig[MethodOptions], HideMetrics, tuple[str, ...]]:
+    """The folder of a hiding, its records, and its sources: the cover, then the secrets; needs no keys.
+
+    Raises UsageError if the scenes were in memory, InputError for other folders.
+    """
+    folder = run_folder(run)
+    config, metrics = read_config(folder / CONFIG), read_record(folder / METRICS, HideMetrics)
+    sources = tuple(source for source in (config.cover, *config.secrets) if source is not None)
+    if len(sources) <= len(config.secrets):
+        raise UsageError(f"{folder} was made from scenes in memory: there are no photos to evaluate against")
+    return folder, config, metrics, sources
+
+
 def open_run(run: PathLike, keys: Sequence[str]) -> HidingRun:
     """Open a folder of `hide` with the keys of all its secrets, in any order.
 
     Raises WrongKeyError for a key that opens nothing, UsageError for a secret without a key and for a run
     whose scenes were in memory, InputError for other folders.
     """
-    folder = run_folder(Path(run))
-    config, metrics = read_config(folder / CONFIG), read_record(folder / METRICS, HideMetrics)
-    sources = tuple(source for source in (config.cover, *config.secrets) if source is not None)
-    if len(sources) <= len(config.secrets):
-        raise UsageError(f"{folder} was made from scenes in memory: there are no photos to evaluate against")
+    folder, config, metrics, sources = read_run(Path(run))
     stego = read_model(stego_in(folder))
     if registry.get(config.method).capabilities.keys:
         opened = [registry.open_model(stego, key) for key in keys]

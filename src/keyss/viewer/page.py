@@ -19,6 +19,7 @@ from keyss.core.errors import KeyssWarning, OutputError, UsageError
 from keyss.files.atomic import check_not_an_input, check_output_file, mode_like, write_bytes
 from keyss.files.file_kinds import is_unpacked_sog, model_file
 from keyss.files.inputs import as_text, read_file
+from keyss.files.model_formats import FORMATS, format_of
 from keyss.viewer.look import Look
 
 SCRIPT, STYLE, LICENCES, INDEX = "viewer.js", "viewer.css", "licences.txt", "index.html"
@@ -33,8 +34,6 @@ SERVED_POLICY = (
     f"default-src {_SELF}; script-src {_SELF} {_WASM}; worker-src {_SELF} blob:; "
     f"img-src {_SELF} blob: data:; {_NOTHING}"
 )
-# The page detects formats by their first bytes, and .splat, which has no signature, by its suffix.
-_MAGIC = (b"ply", b"NGSP", b"\x1f\x8b", b"PK\x03\x04")
 _MAX_HEADER = 64 << 10  # bytes of a .ply
 _ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:[0-9]+)?")
 
@@ -92,19 +91,19 @@ def export_html(
         write_bytes(check_output_file(out, overwrite), page_with(data, name, look), mode)
         return (out,)
     contents = {INDEX: served_page(quote(name), look), name: data}
-    contents |= {each: asset(each) for each in (SCRIPT, STYLE, LICENCES, EMBED)}
+    contents |= {name: asset(name) for name in (SCRIPT, STYLE, LICENCES, EMBED)}
     if len(contents) < 6:
         raise UsageError(f"{model} has the name of a file of the viewer: rename it")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"cannot write {out}: {error.strerror}") from error
-    for each in contents:
-        check_not_an_input(out / each, [model])
-        check_output_file(out / each, overwrite)
-    for each, content in contents.items():
-        write_bytes(out / each, content, mode)
-    return tuple(out / each for each in contents)
+    for name in contents:
+        check_not_an_input(out / name, [model])
+        check_output_file(out / name, overwrite)
+    for name, content in contents.items():
+        write_bytes(out / name, content, mode)
+    return tuple(out / name for name in contents)
 
 
 def asset(name: str) -> bytes:
@@ -146,7 +145,9 @@ def readable(model: Path) -> tuple[str, bytes]:
     gaussians, is_unpacked = as_model(model), is_unpacked_sog(model)
     data = pack_unpacked(model) if is_unpacked else read_file(model)
     is_text = b"\nformat ascii" in data[:_MAX_HEADER].partition(b"end_header")[0]
-    if not is_text and (data.startswith(_MAGIC) or model.name.lower().endswith(".splat")):
+    by_content = [entry for entry in FORMATS if entry.starts(data)]
+    formats = by_content or [entry for entry in FORMATS if entry is format_of(model)]
+    if not is_text and any(entry.in_page for entry in formats):
         return as_text(f"{model.absolute().parent.name}.sog" if is_unpacked else model.name), data
     name, kind = as_text(f"{model.stem}.ply"), "a .ply in text" if is_text else f"a {model.suffix}"
     warnings.warn(

@@ -32,9 +32,8 @@ import torch
 
 from files.formats.false_sizes import FALSE_SIZES, image
 from files.scene_files import camera_bytes, counted, image_bytes, point_bytes
-from keyss.core import Gaussians, InputError
-from keyss.core.picture_network import DecodedGaussians, PictureNetwork
-from keyss.files import load_scene, model_bytes, model_of_bytes
+from keyss.core import DecodedGaussians, Gaussians, InputError, PictureNetwork
+from keyss.files import FORMATS, load_scene, model_bytes, model_of_bytes
 from keyss.files.formats.spz import SpzCodes
 from keyss.files.images import read_image
 from keyss.methods.codec.model_bytes import decode, encode
@@ -44,7 +43,7 @@ from tiny_scenes import random_gaussians
 SECONDS = 2.0  # time limit for a file of a few kilobytes
 CARRIERS = 6000  # Gaussians of the published model that holds a payload
 MEMORY, PER_BYTE = 200 << 20, 32  # memory limit for reading a file: bytes, and bytes per byte of the file
-MODELS = ("a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.glb", "a.splat")
+MODELS = tuple(f"a{suffix}" for each in FORMATS for suffix in each.suffixes)
 NAMES = (
     *MODELS,
     *("a.payload", "a.3dgs.safetensors", "a.tensors", "a.png"),

@@ -54,7 +54,7 @@ def test_compressed_ply_keeps_its_header() -> None:
     assert CompressedPlyCodes.parse(commented).serialise() == commented
 
 
-def test_compressed_ply_of_old_programs_gets_no_colour_bounds() -> None:
+def test_compressed_ply_without_colour_bounds() -> None:
     codes = random_codes("compressed", np.random.default_rng(0), 300, 3)
     codes.bounds[:, 12:] = [0, 0, 0, 1, 1, 1]
     data = codes.serialise()

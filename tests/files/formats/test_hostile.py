@@ -160,7 +160,7 @@ def test_inconsistent_gltf(change: Callable[[dict], object], words: str) -> None
     refused("a.glb", with_json(change), words)
 
 
-def test_small_files_may_hold_many_equal_gaussians(tmp_path: Path) -> None:
+def test_many_equal_gaussians(tmp_path: Path) -> None:
     """Up to 131,072 equal Gaussians may be compressed to any size."""
     model = MODEL[torch.zeros(100_000, dtype=torch.long)]
     write_model(tmp_path / "a.spz", replace(model))

@@ -30,7 +30,7 @@ TRANSFORMS = [
 
 
 @pytest.mark.parametrize(("version", "suffix", "degree"), TRANSFORMS)
-def test_splat_transform_reads_ours_and_we_read_its(
+def test_splat_transform_interoperates(
     request: pytest.FixtureRequest, tmp_path: Path, version: int, suffix: str, degree: int
 ) -> None:
     transform = request.getfixturevalue("splat_transform" if version == 2 else "splat_transform_3")
@@ -92,7 +92,7 @@ def test_chunks_are_as_compact_as_splat_transforms(splat_transform: Transform, t
 
 
 @DEGREES
-def test_we_read_splat_transforms_glb(splat_transform: Transform, tmp_path: Path, degree: int) -> None:
+def test_reads_splat_transform_glb(splat_transform: Transform, tmp_path: Path, degree: int) -> None:
     """It rotates the values of a .ply by 180 degrees, and we rotate them back."""
     model = model_of(200, degree)
     write_model(tmp_path / "in.ply", model)
@@ -135,7 +135,7 @@ def test_we_read_gsplys_spz(tmp_path: Path, version: int, degree: int) -> None:
     assert_close(read_model(tmp_path / "a.spz"), theirs, 1e-5)
 
 
-def test_we_read_gsplys_spz_of_version_2(tmp_path: Path) -> None:
+def test_reads_gsply_spz_version_2(tmp_path: Path) -> None:
     """It reads this version and does not write it."""
     codes = SpzCodes.quantise(model_of(300, 1))
     codes = replace(codes, version=2, largest=np.full_like(codes.largest, 3), rotations=codes.rotations & 63)
@@ -147,7 +147,7 @@ def test_we_read_gsplys_spz_of_version_2(tmp_path: Path) -> None:
 
 
 @DEGREES
-def test_we_read_gsplys_compressed_ply(tmp_path: Path, degree: int) -> None:
+def test_reads_gsply_compressed_ply(tmp_path: Path, degree: int) -> None:
     write_model(tmp_path / "in.ply", model_of(300, degree))
     path = tmp_path / "a.compressed.ply"
     gsply.plywrite(path, gsply.plyread(tmp_path / "in.ply"), compressed=True)
@@ -164,9 +164,7 @@ def test_glb_round_trip(degree: int) -> None:
 
 
 @pytest.mark.parametrize("name", ["spz", "compressed.ply"])
-def test_parsed_files_of_splat_transform_stay_to_the_byte(
-    splat_transform: Transform, tmp_path: Path, name: str
-) -> None:
+def test_splat_transform_files_round_trip(splat_transform: Transform, tmp_path: Path, name: str) -> None:
     write_model(tmp_path / "model.ply", model_of(5000, 3))
     data = splat_transform(tmp_path / "model.ply", tmp_path / f"file.{name}").read_bytes()
     kind = SpzCodes if name == "spz" else CompressedPlyCodes
@@ -174,7 +172,7 @@ def test_parsed_files_of_splat_transform_stay_to_the_byte(
 
 
 @pytest.mark.parametrize(("version", "count"), [(3, 5000), (3, 40_000), (4, 5000)])
-def test_parsed_files_of_gsply_stay_to_the_byte(tmp_path: Path, version: int, count: int) -> None:
+def test_gsply_files_round_trip(tmp_path: Path, version: int, count: int) -> None:
     """Above 1 MiB, gsply compresses blocks on their own."""
     write_model(tmp_path / "model.ply", model_of(count, 3))
     gsply.spz.write_spz(tmp_path / "file.spz", gsply.plyread(str(tmp_path / "model.ply")), version=version)

@@ -1,24 +1,18 @@
-"""A small audited run, and changes of its record."""
+"""A small audited run."""
 
 from __future__ import annotations
 
-import copy
-import json
-import shutil
 import warnings
-from collections.abc import Collection
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-import msgspec
 import pytest
 
 import keyss
 from keyss import Secret
 from keyss.core import KeyssWarning
 from keyss.lab import Change, converters, decoder_attack, half_floats, random_pruning, two_sample
-from keyss.lab.audits import Audit, audit, parts
+from keyss.lab.audits import audit, parts
 from keyss.lab.robustness import survival
 from methods.keyss.small import small
 from test_api import CONFIG, write_nerfstudio
@@ -66,47 +60,3 @@ def _few_changes() -> list[Change]:
         half_floats(),
         sog.change(),
     ]
-
-
-def found_in(run: Path) -> dict[str, Any]:
-    """The JSON of a run's audit, to be changed."""
-    data: dict[str, Any] = json.loads((run / "private" / "audit" / "audit.json").read_bytes())
-    return data
-
-
-def run_with(run: Path, folder: Path, data: object) -> Path:
-    """A copy of a run's audit in a folder, with other JSON."""
-    if not (folder / "private" / "audit").exists():
-        shutil.copytree(run / "private" / "audit", folder / "private" / "audit")
-    (folder / "private" / "audit" / "audit.json").write_text(json.dumps(data))
-    return folder
-
-
-def changed(data: dict[str, Any], *changes: tuple[str, Any]) -> Audit:
-    """The record with other values, as of `put`."""
-    data = copy.deepcopy(data)
-    put(data, *changes)
-    return msgspec.convert(data, Audit)
-
-
-def put(data: dict[str, Any], *changes: tuple[str, Any]) -> None:
-    """Put other values at places such as "images.secrets.0.mean.psnr"."""
-    for place, value in changes:
-        *path, last = (int(step) if step.isdigit() else step for step in place.split("."))
-        at: Any = data
-        for step in path:
-            at = at[step]
-        at[last] = value
-
-
-def with_all_texts(value: Any, text: str, keep: Collection[str]) -> Any:
-    """JSON with every text replaced, except under the names in `keep`."""
-    if isinstance(value, str):
-        return text
-    if isinstance(value, list):
-        return [with_all_texts(item, text, keep) for item in value]
-    if isinstance(value, dict):
-        return {
-            name: item if name in keep else with_all_texts(item, text, keep) for name, item in value.items()
-        }
-    return value

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from keyss.core import InputError
-from keyss.files.atomic import write_bytes
+from keyss.files import write_bytes
 from keyss.lab.many import trial, trial_folder
 from keyss.progress import Reporter
-from keyss.runs.json_records import record_bytes
+from keyss.runs import record_bytes
 
 
 def fake_run(job: trial.Trial, folder: Path, reporter: Reporter) -> trial.Result:

@@ -11,10 +11,10 @@ from PIL import Image
 from keyss import compare
 from keyss.cli import main
 from keyss.core import InputError, OutputError, UsageError
+from keyss.lab import Auc
 from keyss.lab.audits import trial_measures
 from keyss.lab.many import Forecast, comparison, trial
 from keyss.lab.many.trial_folder import claim_folder
-from keyss.lab.two_sample import Auc
 from keyss.methods import registry
 
 SMALL = ["--iterations", "60", "--max-gaussians", "240", "--seed", "3"]

@@ -106,7 +106,7 @@ def skipped(found: tuple[Outcome, ...]) -> list[bool]:
 
 
 @fake_runs
-def test_trials_run_once_and_tables_are_deterministic(tmp_path: Path) -> None:
+def test_trials_run_once(tmp_path: Path) -> None:
     spec = write_spec(tmp_path, ["a.ply", "b.ply"], seeds=3)
     first = run(spec, tmp_path / "out")
     assert skipped(first) == [False] * 6

@@ -1,4 +1,4 @@
-"""All measures of one run: an audit, its record, and its report as an HTML page."""
+"""All measures of one run: an audit, its record, and its report in Markdown."""
 
 import lazy_loader
 

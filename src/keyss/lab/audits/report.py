@@ -1,125 +1,64 @@
-"""The report: one HTML file that opens from disk and loads nothing, enforced by its policy."""
+"""The report of an audit, in Markdown."""
 
 from __future__ import annotations
 
-import hashlib
 import re
-from base64 import b64encode
-from collections.abc import Sequence
-from functools import partial
-from importlib.resources import files
-from pathlib import Path, PurePath
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple
+from pathlib import PurePath
 
-from markupsafe import Markup, escape
+from keyss.lab.audits.parts import PARTS
+from keyss.lab.audits.record import Audit, headline
 
-from keyss.core import InputError, import_extra
-from keyss.files.images import probe_image
-from keyss.files.inputs import read_file
-from keyss.lab.audits import formatting
-from keyss.lab.audits.audit_run import PICTURES, Audit
-from keyss.lab.audits.parts import ImageComparison, ModelImages
-from keyss.lab.audits.summary import auc_text, headline, verdicts, worst_leak
-
-_STYLES = ("page.css", "pictures.css", "print.css")
-_MAX_PICTURE = 32 * 2**20  # bytes
-# By field of `Audit`, in the order of the page: the id of the section and its title.
-_PARTS = {
-    "images": ("images", "Against the test views"),
-    "wrong_key": ("wrong-keys", "Wrong keys"),
-    "leaks": ("leaks", "Leaks without the key"),
-    "stealth": ("stealth", "The file by itself"),
-    "parameters": ("statistics", "Statistics of the model"),
-    "stegexpose": ("renders", "StegExpose on renders"),
-    "robustness": ("robustness", "Robustness"),
-    "speed": ("speed", "Speed"),
-}
+_WORDS = (
+    "Fine: within the limit. Visible: without the key it may be visible that something is hidden, or what. "
+    "Missed: nothing is visible, but the quality of cover or secret is too low. Inconclusive: plain models "
+    "of the cover differ from each other as much; more --controls may help. The limits are conventions, and"
+    " other measures might find what these do not."
+)
 
 
-def report_bytes(audit: Audit, run: Path) -> bytes:
-    """The content of the report.
-
-    Pictures, style and script are embedded. Deterministic. `run` is a folder laid out like a run's, with the
-    audit's pictures. Raises InputError for names outside their folder.
-    """
-    script, lines = _asset("slider.js"), verdicts(audit)
-    models = audit.images.models if audit.images else ()
-    sections = {"verdict": "Verdict"} if lines else {}
-    if audit.images and audit.images.pictures:
-        sections["pictures"] = "Pictures"
-    sections |= {id: title for name, (id, title) in _PARTS.items() if getattr(audit, name)}
-    jinja2 = import_extra("jinja2", "audit", "write a report")
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("keyss.lab.audits"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        finalize=lambda value: "" if value is None else value,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    formats = [*filter(callable, vars(formatting).values()), auc_text, prose]
-    environment.filters |= {each.__name__: each for each in formats}
-    page: str = environment.get_template("page.html").render(
-        audit=audit,
-        title=_title(audit),
-        sections=sections,
-        missing=[title for name, (_, title) in _PARTS.items() if not getattr(audit, name)],
-        picture=partial(embed_picture, run / PICTURES),
-        lines=lines,
-        headline=headline(lines),
-        comparisons=_comparisons(models),
-        worst_leak=worst_leak,
-        all_photos=all(model.photos for model in models),
-        style=Markup("".join(map(_asset, _STYLES))),
-        script=Markup(script),
-        policy=_policy(script),
-    )
-    return page.encode(errors="replace")
+def report_of(audit: Audit, pictures: str) -> str:
+    """The report; `pictures`: the folder of the pictures, relative to the report."""
+    return "\n".join(_lines(audit, pictures))
 
 
-def _policy(script: str) -> str:
-    """A content security policy: even unescaped markup could run no other script and fetch nothing."""
-    digest = b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    return (
-        f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'; "
-        "base-uri 'none'; form-action 'none'"
-    )
+def _lines(audit: Audit, pictures: str) -> Iterator[str]:
+    names = [PurePath(path).name or path for path in (*audit.secrets, audit.cover)]
+    yield f"# {_escaped(' and '.join(names[:-1]))}, hidden in {_escaped(names[-1])}\n"
+    yield "**This report shows the secret: protect it like the key.**\n"
+    facts = {
+        "Method": audit.method,
+        "Cover": audit.cover,
+        "Secrets": ", ".join(audit.secrets),
+        "Published": f"{audit.gaussians:,} Gaussians",
+        "Controls": f"plain models of the cover with the seeds {', '.join(map(str, audit.controls))}",
+        "Not measured": ", ".join(part.title for name, part in PARTS.items() if name not in audit.sections),
+        "Audit": f"keyss {audit.keyss}, {audit.seconds:.0f} s",
+    }
+    yield from (f"- {name}: {_escaped(value)}" for name, value in facts.items() if value)
+    yield f"\n## Verdicts\n\n{_escaped(headline(audit.verdicts))}\n"
+    rows = [astuple(verdict) for verdict in audit.verdicts]
+    if rows:
+        yield from _table(("measure", "measured", "baseline or control", "limit", "verdict"), rows)
+        yield _WORDS
+    for name, section in audit.sections.items():
+        yield f"\n## {PARTS[name].title}\n\n{PARTS[name].note}\n"
+        for table in section.tables:
+            yield from _table(table.heads, table.rows)
+        for caption, file in section.pictures.items():
+            yield f"{_escaped(caption)}\n\n![{_escaped(caption)}]({pictures}/{file})\n"
 
 
-def prose(sentence: str) -> Markup:
-    """Format text with `backquotes` as code."""
-    return Markup(re.sub("`(.*?)`", r"<code>\1</code>", escape(sentence)))
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    yield f"| {' | '.join(map(_escaped, heads))} |"
+    yield "| --- " * len(heads) + "|"
+    for row in rows:
+        cells = [*map(_escaped, row), *[""] * (len(heads) - len(row))]
+        yield f"| {' | '.join(cells)} |"
+    yield ""
 
 
-def _title(audit: Audit) -> str:
-    """The title, with the names of the secrets and the cover."""
-    cover, *secrets = (PurePath(path).name or path for path in (audit.run.cover, *audit.run.secrets))
-    return f"{' and '.join(secrets) or 'A secret'}, hidden in {cover}"
-
-
-def _comparisons(models: Sequence[ModelImages]) -> list[tuple[str, ImageComparison, int | None]]:
-    """Name, comparison and number of Gaussians of each model, each followed by its baseline."""
-    rows: list[tuple[str, ImageComparison, int | None]] = []
-    for index, model in enumerate(models):
-        kind = "revealed" if index else "stego model"
-        rows.append((f"{model.scene}, {kind}", model.images, model.gaussians))
-        if model.baseline is not None:
-            rows.append((f"{model.scene}, plain model (baseline)", model.baseline, model.baseline_gaussians))
-    return rows
-
-
-def _asset(name: str) -> str:
-    return files("keyss.lab.audits").joinpath("assets", name).read_text(encoding="utf-8")
-
-
-def embed_picture(folder: Path, name: str) -> dict[str, int | str]:
-    """Width and height of a picture in pixels, and its data as an URL.
-
-    Raises InputError if it is outside the folder, missing, unreadable or too large.
-    """
-    path = folder / name
-    if name != PurePath(name).name or path.is_symlink():
-        raise InputError(f"expected a picture in {folder}, found {name!r}")
-    data = read_file(path, _MAX_PICTURE)
-    width, height, _ = probe_image(path)
-    url = "data:image/png;base64," + b64encode(data).decode()
-    return {"width": width, "height": height, "url": url}
+def _escaped(text: str) -> str:
+    """`text` in one line, without markup of Markdown or HTML."""
+    return re.sub(r"([\\`*_\[\]<>|#])", r"\\\1", " ".join(text.split()))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from statistics import fmean
 
 from keyss.channels import is_appended
@@ -16,7 +16,8 @@ from keyss.core.errors import UsageError, import_extra
 from keyss.core.gaussians import Gaussians
 from keyss.lab.audits import PARTS
 from keyss.lab.audits.audit_run import EXTRA
-from keyss.lab.audits.parts import Subject, published_distance, render_times, stegexpose_aucs
+from keyss.lab.audits.parts import published_distance, render_times, stegexpose_aucs
+from keyss.lab.audits.subject import Subject, Work
 from keyss.lab.robustness.changes import Change, opacity_pruning, purification, random_pruning
 from keyss.lab.robustness.converters import converters
 from keyss.lab.robustness.survival import ChangedQuality, measure_robustness
@@ -54,10 +55,10 @@ def rendering(subject: Subject) -> Numbers:
 def pictures(subject: Subject, stego: Gaussians | None = None) -> Numbers:
     """Speed of rendering the published model (or `stego`) and the first secret."""
     times = render_times(subject, subject.stego if stego is None else stego, rounds=_ROUNDS)
-    found: Numbers = {}
+    numbers: Numbers = {}
     for role, time in zip(_ROLES, times, strict=False):
-        found |= {f"pictures/s, {role}": 1 / time.seconds, f"time over 3DGS, {role}": time.ratio}
-    return found
+        numbers |= {f"pictures/s, {role}": 1 / time.seconds, f"time over 3DGS, {role}": time.ratio}
+    return numbers
 
 
 def secrecy(subject: Subject) -> Numbers:
@@ -67,26 +68,26 @@ def secrecy(subject: Subject) -> Numbers:
     Gaussians from the controls', and minimum p-value of its statistics, corrected for their number.
     """
     stego, controls = subject.stego, subject.controls
-    found: Numbers = {"stegexpose": stegexpose_aucs(subject, [stego])[0].auc}
+    numbers: Numbers = {"stegexpose": stegexpose_aucs(subject, [stego])[0].auc}
     if subject.standard:
-        found["stealth"] = judge(stego, controls).least
+        numbers["stealth"] = judge(stego, controls).least
         with suppress(UsageError):  # too few Gaussians, or all in a corner
-            found["classifier"] = fmean(two_sample_auc(each, stego).auc for each in controls)
-    return found
+            numbers["classifier"] = fmean(two_sample_auc(control, stego).auc for control in controls)
+    return numbers
 
 
 def survival(subject: Subject) -> Numbers:
     """Changes in dB of cover and secret by pruning, conversion and purification; none for lost secrets."""
-    tools = {(each.format, each.tool): each for each in converters()}
+    tools = {(converter.format, converter.tool): converter for converter in converters()}
     changes = {"pruned": random_pruning(_LOST)}
     if subject.standard:
         changes |= {format: tools[format, tool].change() for format, tool in CONVERSIONS.items()}
         changes["purified"] = purification(subject.scenes[0], _GIVEN_UP)
-    found = _after(subject, changes, lambda quality: 0.0 - quality.loss)
-    found = {name: value for name, value in found.items() if not name.startswith(_WHOLE)}
+    numbers = _after(subject, changes, lambda quality: 0.0 - quality.loss)
+    numbers = {name: value for name, value in numbers.items() if not name.startswith(_WHOLE)}
     if not subject.standard:
-        found |= dict.fromkeys((*CONVERSIONS, "purified"), "the method publishes no 3DGS model")
-    return found
+        numbers |= dict.fromkeys((*CONVERSIONS, "purified"), "the method publishes no 3DGS model")
+    return numbers
 
 
 def pruning(subject: Subject) -> Numbers:
@@ -112,34 +113,47 @@ def _after(
     """
     openers, every = subject.run.openers, list(changes.values())
     results = measure_robustness(subject.stego, openers, subject.scenes, changes=every, max_views=max_views)
-    found: Numbers = {}
+    numbers: Numbers = {}
     for name, result in zip([_WHOLE, *changes], results, strict=True):
         if result.skipped is not None:
-            found[name] = result.skipped
+            numbers[name] = result.skipped
         for role, quality in zip(_ROLES, (result.cover, *result.secrets), strict=False):
             if quality is not None and quality.opens:
-                found[f"{name}, {role}"] = number(quality)
-    return found
+                numbers[f"{name}, {role}"] = number(quality)
+    return numbers
 
 
 def sinkhorn(subject: Subject) -> Numbers:
     """3D-Sinkhorn from the cover's plain model to the published one: sum, attributes, composite score."""
     distances, score = published_distance(subject, own_gaussians(subject.stego))
-    found: Numbers = {f"sinkhorn {short}": getattr(distances, name) for name, short in _ATTRIBUTES.items()}
-    return found | {"sinkhorn": distances.sum, "score": score}
+    numbers: Numbers = {f"sinkhorn {short}": getattr(distances, name) for name, short in _ATTRIBUTES.items()}
+    return numbers | {"sinkhorn": distances.sum, "score": score}
 
 
-# Modules of optional packages that measures import.
-_MODULES = {"secrecy": ("sklearn",), "sinkhorn": ("ot",), **dict.fromkeys(PARTS, EXTRA)}
-MEASURES: Mapping[str, Callable[[Subject], Numbers]] = {
-    each.__name__: each for each in (files, pictures, secrecy, survival, rendering, pruning, sinkhorn)
+@dataclass(frozen=True)
+class Measure:
+    """An entry of the table of measures."""
+
+    numbers: Callable[[Subject], Numbers]
+    work: Work
+    modules: tuple[str, ...] = ()  # of the extra `audit`
+
+
+MEASURES = {
+    "files": Measure(files, Work()),
+    "pictures": Measure(pictures, Work(views=8)),
+    "secrecy": Measure(secrecy, Work(seconds=0.5, views=43, per_gaussian=9e-4), ("sklearn",)),
+    "survival": Measure(survival, Work(seconds=8.0, views=48)),
+    "rendering": Measure(rendering, Work(views=16)),
+    "pruning": Measure(pruning, Work(seconds=8.0, views=200)),
+    "sinkhorn": Measure(sinkhorn, Work(seconds=1.0, per_gaussian=1e-4), ("ot",)),
 }
 
 
 def check_extras(measures: Iterable[str]) -> None:
-    """Raise BackendError if a package of one of the measures is not installed."""
+    """Raise BackendError if a package of one of the measures, or parts of an audit, is not installed."""
     for name in measures:
-        for module in _MODULES.get(name, ()):
+        for module in EXTRA if name in PARTS else MEASURES[name].modules:
             import_extra(module, "audit", f"measure {name}")
 
 

@@ -107,8 +107,8 @@ def hide_opacities(cover: Gaussians, secret: Tensor) -> tuple[Tensor, nn.Sequent
     for step in range(STEPS):
         optimizer.param_groups[0]["lr"] = RATE * 0.01 ** (step / STEPS)
         published = cover.opacity_logits + encoder(known)[:, 0]
-        found = decoder(known_of(cover, published))[:, 0]
-        loss = (found.sigmoid() - secret.sigmoid()).square().mean()
+        decoded = decoder(known_of(cover, published))[:, 0]
+        loss = (decoded.sigmoid() - secret.sigmoid()).square().mean()
         loss = loss + FIDELITY * (published.sigmoid() - cover.opacities).square().mean()
         optimizer.zero_grad()
         loss.backward()

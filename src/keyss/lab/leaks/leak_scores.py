@@ -122,7 +122,6 @@ class AttackResult:
     best: str  # the variant with the maximum `LeakScores.evidence`
     scores: LeakScores  # of the best variant
     leak: LeakScores  # `scores` minus the controls' maxima over the variants
-    picture: str | None = None  # name of a file, in an audit
 
 
 @torch.no_grad()

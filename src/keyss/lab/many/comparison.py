@@ -39,8 +39,8 @@ CONTROLS = ("control-1", "control-2")  # names of the seeds of plain models of t
 # Every method, and its variants.
 EVERY = tuple(
     name
-    for each in registry.METHODS
-    for name in (each, *(f"{each}:{variant}" for variant in registry.get(each).options.variants()))
+    for method in registry.METHODS
+    for name in (method, *(f"{method}:{variant}" for variant in registry.get(method).options.variants()))
 )
 
 # %-formats by column. The first one whose numbers were all measured is used.
@@ -146,7 +146,7 @@ def compare(
     fit = replace(next(iter(chosen.values())).fit, seed=seeds[0], **given)
     scenes = [os.path.realpath(cover), os.path.realpath(secret)]
     folder = TrialFolder(Path(out), common={"views": ViewOptions(width), "device": device})
-    controls = [folder.plain(scenes[0], replace(fit, seed=fit.seed_of(each))) for each in CONTROLS]
+    controls = [folder.plain(scenes[0], replace(fit, seed=fit.seed_of(name))) for name in CONTROLS]
     places = {
         (name, seed): _add(folder, name, scenes, preset, replace(fit, seed=seed), controls)
         for name, preset in chosen.items()
@@ -163,20 +163,20 @@ def compare(
     arguments = {"cover": scenes[0], "secret": scenes[1], "iterations": fit.iterations}
     arguments |= {"max_gaussians": fit.max_gaussians, "width": width, "seeds": list(seeds)}
     rows = [_row(name, [outcomes[places[name, seed]] for seed in seeds], folder) for name in chosen]
-    found = Comparison(arguments=arguments, methods=tuple(rows))
-    write_record(folder.out / f"{STEM}.json", found)
+    comparison = Comparison(arguments=arguments, methods=tuple(rows))
+    write_record(folder.out / f"{STEM}.json", comparison)
     names = [os.path.basename(scene) for scene in scenes]
     done = {each: outcomes[place] for each, place in places.items() if outcomes[place].result}
-    numbers = [TrialNumbers({"method": name}, names, seed, each) for (name, seed), each in done.items()]
+    numbers = [TrialNumbers({"method": name}, names, seed, outcome) for (name, seed), outcome in done.items()]
     write_scene_tables(folder.out, STEM, numbers)
     runs = {
-        name: opened_run(folder.trials[each.folder], each.folder)
-        for (name, seed), each in done.items()
+        name: opened_run(folder.trials[outcome.folder], outcome.folder)
+        for (name, seed), outcome in done.items()
         if seed == seeds[0]
     }
     if runs:
         write_bytes(folder.out / f"{STEM}.png", comparison_sheet(runs, device))
-    return found
+    return comparison
 
 
 def _add(
@@ -188,20 +188,20 @@ def _add(
     controls: list[str],
 ) -> Path:
     """Add a hiding and its plain fits; returns the folder of the hiding."""
-    own = fit.iterations // 2
-    continues = [each.continues and each.steps > 0 for each in preset.training(2)]
+    half = fit.iterations // 2
+    continues = [training.continues and training.steps > 0 for training in preset.training(2)]
     options = preset.with_fit(
-        iterations=max(1, own) if any(continues) else fit.iterations,
+        iterations=max(1, half) if any(continues) else fit.iterations,
         max_gaussians=fit.max_gaussians,
         seed=fit.seed,
     )
-    steps = [fit.iterations - own if each else fit.iterations for each in continues]
+    steps = [fit.iterations - half if continued else fit.iterations for continued in continues]
     models = [
         folder.plain(
             scene,
-            replace(fit, iterations=count, sh_degree=each.sh_degree, max_gaussians=each.max_gaussians),
+            replace(fit, iterations=count, sh_degree=config.sh_degree, max_gaussians=config.max_gaussians),
         )
-        for scene, count, each in zip(scenes, steps, options.fits(2), strict=True)
+        for scene, count, config in zip(scenes, steps, options.fits(2), strict=True)
     ]
     return folder.hiding(name, scenes, options, models, measures=MEASURES, controls=controls)
 
@@ -220,12 +220,14 @@ def _row(name: str, outcomes: Sequence[Outcome], folder: TrialFolder) -> Compare
     """The means of the numbers that all seeds have."""
     method = registry.get(folder.trials[outcomes[0].folder].method)
     row = ComparedMethod(name=name, keys=method.capabilities.keys)
-    results = [each.result for each in outcomes if each.result is not None]
+    results = [outcome.result for outcome in outcomes if outcome.result is not None]
     if len(results) < len(outcomes):
-        return replace(row, error=next(each.error for each in outcomes if each.error))
-    shared = set.intersection(*(set(each.numbers) for each in results))
+        return replace(row, error=next(outcome.error for outcome in outcomes if outcome.error))
+    shared = set.intersection(*(set(result.numbers) for result in results))
     numbers = {
-        each: fmean(one.numbers[each] for one in results) for each in results[0].numbers if each in shared
+        measure: fmean(one.numbers[measure] for one in results)
+        for measure in results[0].numbers
+        if measure in shared
     }
     return replace(row, numbers=numbers, notes=results[0].notes)
 
@@ -248,9 +250,9 @@ def comparison_sheet(runs: Mapping[str, HidingRun], device: Backend) -> bytes:
     return contact_sheet(["cover", "secret", "error of the secret, x4"], rows)
 
 
-def comparison_tables(found: Comparison) -> list[list[list[str]]]:
+def comparison_tables(comparison: Comparison) -> list[list[list[str]]]:
     """Two tables of text, heads first: fidelity and cost, secrecy and survival; without failed methods."""
-    rows = [each for each in found.methods if each.error is None]
+    rows = [row for row in comparison.methods if row.error is None]
     return [
         [
             ["method", *(head.rstrip() for head in columns)],
@@ -262,9 +264,9 @@ def comparison_tables(found: Comparison) -> list[list[list[str]]]:
 
 def _format(row: ComparedMethod, formats: list[str]) -> str:
     values = row.numbers | {"wrong keys": "open nothing" if row.keys else "no keys"}
-    for each in formats:
+    for template in formats:
         with suppress(KeyError):
-            return each % values
+            return template % values
     return ""
 
 

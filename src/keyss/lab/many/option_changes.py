@@ -22,7 +22,7 @@ def with_changes(preset: MethodOptions, changes: Mapping[str, Any]) -> MethodOpt
     kinds: dict[str, Any] = {"": type(preset), "fit": FitConfig}
     if isinstance(preset, KeyssOptions):
         kinds["design"] = Design
-    known = {f"{kind}.{each.name}".lstrip(".") for kind in kinds for each in fields(kinds[kind])}
+    known = {f"{kind}.{option.name}".lstrip(".") for kind in kinds for option in fields(kinds[kind])}
     known -= {"fit", "fit.seed"}
     parts: dict[str, dict[str, Any]] = {kind: {} for kind in kinds}
     for name, value in changes.items():

@@ -168,7 +168,7 @@ def reproduce(
         shown = group[: run.secrets + 1]
         sources = [paths[scene] for scene in shown]
         fits = options.fits(len(sources))
-        models = [folder.plain(*each) for each in zip(sources, fits, strict=True)]
+        models = [folder.plain(*fit) for fit in zip(sources, fits, strict=True)]
         title = f"{name}, {'-'.join(group)}" + f", seed {seed}" * (len(seeds) > 1)
         places[folder.hiding(title, sources, options, models, measures=spec.measures)] = name, shown, seed
     if dry_run:
@@ -191,7 +191,7 @@ def reproduce(
         pairs=tuple("-".join(group) for group in groups),
         rows=figures,
         claims=tuple(judge_claim(claim, measured) for claim in spec.claims),
-        failures={each.name: each.error for each in outcomes.values() if each.error},
+        failures={outcome.name: outcome.error for outcome in outcomes.values() if outcome.error},
     )
     write_record(folder.out / f"{table}.json", reproduction)
     order = list(spec.runs)
@@ -265,7 +265,7 @@ def figure_rows(
     for name, run in table.runs.items():
         here: dict[str, float | None] = {}
         for measure in every:
-            values = [each[measure] for each in numbers.get(name, ()) if measure in each]
+            values = [trial[measure] for trial in numbers.get(name, ()) if measure in trial]
             if values or measure in run.figures:
                 here[measure] = fmean(values) if len(values) == count else None
         published = {measure: mean_figure(table, figure, covers) for measure, figure in run.figures.items()}
@@ -330,7 +330,9 @@ def reproduction_rows(reproduction: Reproduction) -> list[list[str]]:
 
 def reproduction_notes(reproduction: Reproduction) -> list[str]:
     """A line per claim and per failed run."""
-    lines = [f"{each.verdict} ({each.holding} of {each.parts}): {each.text}" for each in reproduction.claims]
+    lines = [
+        f"{claim.verdict} ({claim.holding} of {claim.parts}): {claim.text}" for claim in reproduction.claims
+    ]
     return [*lines, *(f"failed: {name}: {error}" for name, error in reproduction.failures.items())]
 
 

@@ -48,8 +48,8 @@ def summaries(trials: Sequence[TrialNumbers]) -> list[dict[str, Any]]:
     """Rows of means and standard deviations over seeds, in the order of trials, then by measure."""
     rows = []
     for labels, group in _group(trials):
-        for measure in sorted({name for each in group for name in each.numbers}):
-            values = [each.numbers[measure] for each in group if measure in each.numbers]
+        for measure in sorted({name for trial in group for name in trial.numbers}):
+            values = [trial.numbers[measure] for trial in group if measure in trial.numbers]
             mean, std = mean_and_std(values)
             rows.append({**labels, "measure": measure, "seeds": len(values), "mean": mean, "std": std})
     return rows
@@ -64,7 +64,7 @@ def scene_rows(trials: Sequence[TrialNumbers]) -> list[dict[str, Any]]:
             row = {**labels, "scene": scene, "role": role, "seeds": len(group)}
             for metric in _METRICS:
                 name = f"{part}.{metric}"
-                values = [each.numbers[name] for each in group if name in each.numbers]
+                values = [trial.numbers[name] for trial in group if name in trial.numbers]
                 row[metric], row[f"{metric}_std"] = mean_and_std(values)
             rows.append(row)
     return rows
@@ -96,10 +96,10 @@ def write_scene_tables(out: Path, stem: str, trials: Sequence[TrialNumbers]) -> 
 def write_sweep_tables(out: Path, trials: Sequence[TrialNumbers]) -> None:
     """Write `results.csv` and `trials.csv` with all measures, and `scenes`. Raises OutputError."""
     rows = [
-        {**labels, "seed": each.seed, "trial": each.outcome.folder.name, "measure": measure, "value": value}
+        {**labels, "seed": trial.seed, "trial": trial.outcome.folder.name, "measure": measure, "value": value}
         for labels, group in _group(trials)
-        for each in group
-        for measure, value in sorted(each.numbers.items())
+        for trial in group
+        for measure, value in sorted(trial.numbers.items())
     ]
     write_bytes(out / "results.csv", csv_bytes(summaries(trials)))
     write_bytes(out / "trials.csv", csv_bytes(rows))
@@ -118,7 +118,7 @@ def latex(rows: Sequence[Mapping[str, Any]]) -> str:
         r"\midrule",
     ]
     for row in rows:
-        cells = ["".join(_LATEX.get(each, each) for each in row[name]) for name in texts]
+        cells = ["".join(_LATEX.get(character, character) for character in row[name]) for name in texts]
         for metric, (decimals, _) in _METRICS.items():
             mean, std = row[metric], row[f"{metric}_std"]
             spread = "" if math.isnan(std) else rf" $\pm$ {std:.{decimals}f}"

@@ -76,7 +76,7 @@ def read_spec(path: Path) -> SweepSpec:
         raise InputError(f"{path}: expected YAML of a sweep: {' '.join(str(error).split())}") from error
     most = min(registry.get(entry.method).max_secrets for entry in spec.methods)
     pairs = [_resolve_pair(path, index, pair, most) for index, pair in enumerate(spec.pairs)]
-    methods = [msgspec.structs.replace(each, name=each.name or each.method) for each in spec.methods]
+    methods = [msgspec.structs.replace(method, name=method.name or method.method) for method in spec.methods]
     spec = msgspec.structs.replace(spec, pairs=tuple(pairs), methods=tuple(methods))
     unique: dict[str, list[Any]] = {"seeds": list(spec.seeds)}
     unique |= {"pairs": [each.name for each in spec.pairs], "methods": [each.name for each in spec.methods]}
@@ -124,9 +124,9 @@ def _resolve_pair(path: Path, index: int, pair: Pair, most: int) -> Pair:
         pair,
         name=pair.name or "-".join(Path(source).stem for source in (pair.cover, *pair.secrets)),
         cover=absolute("cover", pair.cover),
-        secrets=tuple(absolute("secrets", each) for each in pair.secrets),
+        secrets=tuple(absolute("secrets", source) for source in pair.secrets),
         cover_model=pair.cover_model and absolute("cover_model", pair.cover_model),
-        secret_models=tuple(absolute("secret_models", each) for each in pair.secret_models),
+        secret_models=tuple(absolute("secret_models", source) for source in pair.secret_models),
     )
 
 
@@ -148,12 +148,12 @@ def sweep(
     errors.
     """
     path = Path(spec)
-    found = read_spec(path)
-    common = {name: getattr(found, name) for name in ("min_psnr", "bound", "device")}
-    common["views"] = ViewOptions(found.width, found.background, found.skip_missing)
+    spec_ = read_spec(path)
+    common = {name: getattr(spec_, name) for name in ("min_psnr", "bound", "device")}
+    common["views"] = ViewOptions(spec_.width, spec_.background, spec_.skip_missing)
     folder = TrialFolder(Path(out), common)
     rows: dict[Path, tuple[dict[str, Any], list[str], int]] = {}  # labels, scenes and seed
-    for pair, (method, preset, choices), seed in product(found.pairs, variants(path, found), found.seeds):
+    for pair, (method, preset, choices), seed in product(spec_.pairs, variants(path, spec_), spec_.seeds):
         options = preset.with_fit(seed=seed)
         sources = [pair.cover, *pair.secrets]
         given = [pair.cover_model, *(pair.secret_models or [None] * len(pair.secrets))]
@@ -163,7 +163,7 @@ def sweep(
         ]
         chosen = "".join(f" {name}={value}" for name, value in choices.items())
         name = f"{pair.name} {method}{chosen} seed {seed}"
-        place = folder.hiding(name, sources, options, models, measures=found.evaluate)
+        place = folder.hiding(name, sources, options, models, measures=spec_.evaluate)
         labels = {"pair": pair.name, "method": method, **choices}
         rows.setdefault(place, (labels, [Path(source).stem for source in sources], seed))
     if dry_run:

@@ -27,7 +27,7 @@ from keyss.files import read_model, write_bytes
 from keyss.fitting import FitConfig
 from keyss.keys import MasterKey, read_key
 from keyss.lab.audits import PARTS, audit
-from keyss.lab.audits.parts import Subject
+from keyss.lab.audits.subject import Subject
 from keyss.lab.audits.trial_measures import MEASURES
 from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
@@ -37,7 +37,7 @@ from keyss.runs.estimates import seconds_for
 from keyss.runs.files import METRICS, as_scene, stego_in
 from keyss.runs.folder import PRIVATE, make_private
 from keyss.runs.open_run import HidingRun, open_run
-from keyss.runs.planning import Cost, cost_of_fit, view_seconds
+from keyss.runs.planning import Cost, cost_of_fit
 
 TRIAL, RESULT, RUN = "trial.json", "result.json", "run"
 MASTER_KEY = f"{PRIVATE}/master-key.txt"  # relative to the folder of all trials
@@ -68,27 +68,16 @@ class Trial:
     def identity(self) -> str:
         """SHA-256 (hexadecimal) of all that the run depends on: not of its measures."""
         same = replace(self, name="", measures=())
-        models = [each for each in self.models if each and os.path.isabs(each)]
+        models = [path for path in self.models if path and os.path.isabs(path)]
         inputs = [self.cover, *self.secrets, *models]
-        times = {each: os.stat(each).st_mtime_ns if os.path.exists(each) else 0 for each in inputs}
+        times = {path: os.stat(path).st_mtime_ns if os.path.exists(path) else 0 for path in inputs}
         return hashlib.sha256(record_bytes(same) + msgspec.json.encode(times)).hexdigest()
 
     @property
     def needs(self) -> list[str]:
         """Names of the trials whose models it uses."""
-        models = [each for each in (*self.models, *self.controls) if each and not os.path.isabs(each)]
-        return [Path(each).parts[1] for each in models]
-
-
-# Seconds of measures: of all, mostly attempts to open; in views rendered; and per Gaussian.
-_COSTS = {
-    "files": (0.0, 0, 0.0),
-    "pictures": (0.0, 8, 0.0),
-    "secrecy": (0.5, 43, 9e-4),
-    "survival": (8.0, 48, 0.0),
-    "robustness": (100.0, 1000, 0.0),
-}
-_OTHER_COST = 1.0, 16, 1e-4
+        models = [path for path in (*self.models, *self.controls) if path and not os.path.isabs(path)]
+        return [Path(path).parts[1] for path in models]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,12 +110,13 @@ def run_trial(trial: Trial, folder: Path, reporter: Reporter) -> Result:
     write_bytes(folder / TRIAL, record_bytes(trial))
     if before is None:
         before = Result(seconds=0.0, numbers=_fit_or_hide(trial, folder, reporter))
-    missing = [each for each in trial.measures if each not in before.measures]
+    missing = [measure for measure in trial.measures if measure not in before.measures]
     measured = _measure(trial, missing, folder, reporter) if missing else {}
     result = Result(
         seconds=round(time.monotonic() - start, 1),
-        numbers=before.numbers | {name: each for name, each in measured.items() if not isinstance(each, str)},
-        notes=before.notes | {name: each for name, each in measured.items() if isinstance(each, str)},
+        numbers=before.numbers
+        | {name: value for name, value in measured.items() if not isinstance(value, str)},
+        notes=before.notes | {name: value for name, value in measured.items() if isinstance(value, str)},
         measures=tuple(dict.fromkeys((*before.measures, *trial.measures))),
     )
     write_bytes(folder / RESULT, record_bytes(result))
@@ -149,8 +139,7 @@ def cost_of_trial(trial: Trial, folder: Path) -> Cost:
 
 def _seconds_of(measures: Sequence[str], view: float, gaussians: int) -> float:
     """About the seconds of measures; `view`: see `Cost.view_seconds`, `gaussians`: of the published model."""
-    costs = [_COSTS.get(name, _OTHER_COST) for name in measures]
-    return sum(fixed + views * view + each * gaussians for fixed, views, each in costs)
+    return sum((PARTS.get(name) or MEASURES[name]).work.time(view, gaussians) for name in measures)
 
 
 def keys_of(trial: Trial, folder: Path) -> list[str]:
@@ -186,15 +175,15 @@ def flat(record: Any, prefix: str = "") -> dict[str, float]:
         return {prefix: float(record)}
     if isinstance(record, list | tuple):
         record = dict(enumerate(record, start=1))
-    found: dict[str, float] = {}
-    for name, each in record.items() if isinstance(record, dict) else ():
-        found |= flat(each, f"{prefix}.{name}" if prefix else str(name))
-    return found
+    numbers: dict[str, float] = {}
+    for name, value in record.items() if isinstance(record, dict) else ():
+        numbers |= flat(value, f"{prefix}.{name}" if prefix else str(name))
+    return numbers
 
 
 def _hide_arguments(trial: Trial, folder: Path, keys: list[str]) -> dict[str, Any]:
     """The arguments of `hide`, without models that do not exist yet."""
-    places = [each and _place(folder, each) for each in trial.models]
+    places = [path and _place(folder, path) for path in trial.models]
     cover, *models = (place if place and place.exists() else None for place in places)
     blank = [""] * len(trial.secrets)  # for methods without keys
     return {
@@ -224,18 +213,16 @@ def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -
         more: dict[str, Any] = {"device": trial.device, "overwrite": done, "resume": resume}
         audited = audit(run, keys_of(trial, folder), only=parts, reporter=reporter, **more)
         for part in parts:
-            found |= flat(msgspec.to_builtins(getattr(audited, part)), f"audit.{part}")
+            found |= flat(audited.sections[part].numbers, f"audit.{part}")
     if others := [name for name in names if name not in PARTS]:
         device = resolve_device(trial.device)
         with reporter.waiting(f"opening {trial.name}", seconds_for("reveal", stego_in(folder / RUN))):
-            controls = [read_model(_place(folder, each)).to(device) for each in trial.controls]
+            controls = [read_model(_place(folder, path)).to(device) for path in trial.controls]
             subject = Subject(opened_run(trial, folder), device, controls)
-            models = [subject.stego, *subject.revealed]
-            view = sum(
-                view_seconds(device.type, len(model), scene)
-                for model, scene in zip(models, subject.scenes, strict=True)
-            )
+            view = subject.view_seconds
         for name in others:
             with reporter.waiting(f"{trial.name}: {name}", _seconds_of([name], view, len(subject.stego))):
-                found |= {f"{name}.{each}": value for each, value in MEASURES[name](subject).items()}
+                found |= {
+                    f"{name}.{measure}": value for measure, value in MEASURES[name].numbers(subject).items()
+                }
     return found

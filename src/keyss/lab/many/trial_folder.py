@@ -62,7 +62,7 @@ class TrialFolder:
     def plain(self, scene: str, config: FitConfig) -> str:
         """Add the plain fit of a scene; returns its model, relative to the folder of another trial."""
         name = f"plain model of {Path(scene).name}, {config.iterations:,} steps, seed {config.seed}"
-        shared = {each: self.common[each] for each in ("views", "device")}
+        shared = {field: self.common[field] for field in ("views", "device")}
         return f"../{self._add(Trial(name=name, cover=scene, options=config, **shared)).name}/{RUN}/{MODEL}"
 
     def hiding(
@@ -113,18 +113,18 @@ class TrialFolder:
         with claim_folder(self.out):
             if not (self.out / MASTER_KEY).exists():
                 write_bytes(self.out / MASTER_KEY, f"{generate_key(LONG_KEY_LENGTH)}\n".encode())
-            found = {
+            outcome_of = {
                 folder: Outcome(trial.name, folder, result, skipped=True)
                 for folder, trial in self.trials.items()
                 if (result := finished_result(trial, folder)) is not None
             }
-            due = {folder: trial for folder, trial in self.trials.items() if folder not in found}
+            due = {folder: trial for folder, trial in self.trials.items() if folder not in outcome_of}
             outcomes = _in_process(due, reporter) if ray is None or not due else _on_ray(due, ray, cores)
             for number, outcome in enumerate(outcomes, start=1):
                 state = "failed" if outcome.error else "done"
                 reporter.note(f"[{number}/{len(due)}] {outcome.name}: {state}")
-                found[outcome.folder] = outcome
-        return {folder: found[folder] for folder in self.trials}
+                outcome_of[outcome.folder] = outcome
+        return {folder: outcome_of[folder] for folder in self.trials}
 
     def forecast(self) -> Forecast:
         """The cost of each trial. Writes nothing."""
@@ -167,14 +167,14 @@ def _in_process(trials: Mapping[Path, Trial], reporter: Reporter) -> Iterator[Ou
 
 def _needed(trial: Trial, folder: Path, started: Mapping[Path, Any]) -> list[Any]:
     """What `started` has of the trials whose models this one uses."""
-    places = [folder.with_name(each) for each in trial.needs]
-    return [started[each] for each in places if each in started]
+    places = [folder.with_name(name) for name in trial.needs]
+    return [started[place] for place in places if place in started]
 
 
 def _attempt(trial: Trial, folder: Path, reporter: Reporter | None, *needed: Outcome) -> Outcome:
     """Run one trial; an error becomes a part of its outcome."""
     outcome = Outcome(trial.name, folder)
-    if failed := [each.error for each in needed if each.error]:
+    if failed := [outcome.error for outcome in needed if outcome.error]:
         return replace(outcome, error=failed[0])
     try:
         return replace(outcome, result=run_trial(trial, folder, reporter or default_reporter()))
@@ -202,7 +202,7 @@ def _on_ray(trials: Mapping[Path, Trial], address: str, cores: int) -> Iterator[
             chosen = attempt.options(name=trial.name, num_cpus=cores, num_gpus=int(trial.device == "cuda"))
             needed = _needed(trial, folder, started)
             started[folder] = chosen.remote(trial, folder.absolute(), None, *needed)
-        running = {each: folder for folder, each in started.items()}
+        running = {task: folder for folder, task in started.items()}
         while running:
             (done,), _ = ray.wait(list(running))
             folder = running.pop(done)

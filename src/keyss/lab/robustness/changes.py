@@ -34,7 +34,6 @@ class Change:
 
     attack: str  # changes of one attack differ in strength only
     strength: float
-    unit: str  # unit of `strength`
     sentence: str  # what it does, for the report
     apply: Callable[[Gaussians], Gaussians]
     steps: int = 0  # of training
@@ -67,7 +66,7 @@ def _pruning(attack: str, share: float, sentence: str, order: Callable[[Gaussian
         removed = min(round(share * len(model)), len(model) - 1)
         return model[order(model)[removed:].sort().values]
 
-    return Change(attack, share, "share removed", sentence, apply)
+    return Change(attack, share, sentence, apply)
 
 
 def noise(attribute: str, strength: float, seed: int = 0) -> Change:
@@ -93,7 +92,7 @@ def noise(attribute: str, strength: float, seed: int = 0) -> Change:
         return replace(model, sh=torch.cat(changed, dim=1))
 
     sentence = f"Normal noise of {strength:g} times its spread is added to the {attribute} of every Gaussian."
-    return Change(f"noise on {attribute}", strength, "spreads of the attribute", sentence, apply)
+    return Change(f"noise on {attribute}", strength, sentence, apply)
 
 
 def _spread(values: Tensor) -> Tensor:
@@ -111,7 +110,7 @@ def cropping(seed: int = 0) -> Change:
         return model[order[len(model) // 2 :].sort().values]
 
     sentence = "Only the half of the Gaussians on one side of a plane is kept."
-    return Change("cropping", 0.5, "share removed", sentence, apply)
+    return Change("cropping", 0.5, sentence, apply)
 
 
 def fewer_harmonics(degree: int) -> Change:
@@ -121,26 +120,20 @@ def fewer_harmonics(degree: int) -> Change:
     def apply(model: Gaussians) -> Gaussians:
         return model.with_sh_degree(min(degree, model.sh_degree))
 
-    return Change("fewer harmonics", degree, "degree left", sentence, apply)
+    return Change("fewer harmonics", degree, sentence, apply)
 
 
 def half_floats() -> Change:
     """Round every number to half precision (IEEE 754 binary16) and back."""
     sentence = "Every number is rounded to half precision."
-    return Change("half floats", 16, "bits a number", sentence, lambda m: m.map(lambda x: x.half().float()))
+    return Change("half floats", 16, sentence, lambda m: m.map(lambda x: x.half().float()))
 
 
 def fine_tuning(cover: Scene, steps: int = 500, seed: int = 0) -> Change:
     """Continue training on the cover's photos, as plain 3DGS without density control."""
     sentence = f"Training continues on the cover's photos for {steps} steps."
-    return Change(
-        "fine-tuning",
-        steps,
-        "steps",
-        sentence,
-        partial(fine_tune, scene=cover, steps=steps, seed=seed),
-        steps,
-    )
+    apply = partial(fine_tune, scene=cover, steps=steps, seed=seed)
+    return Change("fine-tuning", steps, sentence, apply, steps)
 
 
 def purification(cover: Scene, given_up: float = 0.0, steps: int = 300, seed: int = 0) -> Change:
@@ -162,7 +155,7 @@ def purification(cover: Scene, given_up: float = 0.0, steps: int = 300, seed: in
         f"{f', giving up {given_up:.1%} of what those show' if given_up else ''}; "
         f"then training continues for {steps} steps."
     )
-    return Change("purification", given_up, "share of the blending weight given up", sentence, apply, steps)
+    return Change("purification", given_up, sentence, apply, steps)
 
 
 def fine_tune(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaussians:

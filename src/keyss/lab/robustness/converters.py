@@ -50,7 +50,7 @@ class Converter:
     def change(self) -> Change:
         sentence = f"Converted to {self.format} and back by {self.tool}{self.note}."
         attack = f"conversion to {self.format} by {self.tool}"
-        return Change(attack, 1, "times", sentence, lambda model: self(model).to(model.device))
+        return Change(attack, 1, sentence, lambda model: self(model).to(model.device))
 
 
 def converters(sog_iterations: int = 1) -> list[Converter]:

@@ -45,7 +45,6 @@ class ChangeResult:
 
     attack: str  # changes of one attack differ in strength only
     strength: float
-    unit: str
     sentence: str
     seeds: int = 1  # number of changes averaged
     skipped: str | None = None  # the missing tool; `cover` and `secrets` are unset then
@@ -105,13 +104,13 @@ def measure_robustness(
 
     results: dict[tuple[str, float], list[ChangeResult]] = {}
     before: list[float] = []
-    unchanged = Change("none", 0, "", "Nothing is changed.", lambda model: model)
+    unchanged = Change("none", 0, "Nothing is changed.", lambda model: model)
     done, work = 0, sum(_STEPS_TO_MEASURE + each.steps for each in [unchanged, *changes])
     for each in [unchanged, *changes]:
         if progress is not None:
             progress(done, work)
         done += _STEPS_TO_MEASURE + each.steps
-        result = ChangeResult(each.attack, each.strength, each.unit, each.sentence)
+        result = ChangeResult(each.attack, each.strength, each.sentence)
         try:
             changed = each(stego)
         except BackendError as error:

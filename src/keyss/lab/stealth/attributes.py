@@ -67,17 +67,17 @@ def invariants(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     """Unit quaternions in the file and its parts, repeated values, clusters, short numbers."""
     statistics = _lengths(model)
     for index, attribute in enumerate(ATTRIBUTES):
-        own = words.bits[:, words.of_attribute(index)]
-        if not own.size:
+        numbers = words.bits[:, words.of_attribute(index)]
+        if not numbers.size:
             continue
         trained = words.trained[:, words.of_attribute(index)]
         statistics[f"short numbers, {attribute}"] = portion(float((~trained).sum()), trained.size)
-        fields = zip(own.T, trained.T, strict=True)
+        fields = zip(numbers.T, trained.T, strict=True)
         counts = [np.unique(values[kept], return_counts=True)[1] for values, kept in fields]
-        repeated = sum(int(each[each > 1].sum()) for each in counts)
-        statistics[f"repeated values, {attribute}"] = portion(repeated, own.size)
-        clusters = [_clusters(values.view(np.float32).astype(np.float64)) for values in own.T]
-        hits, trials = (sum(each) for each in zip(*clusters, strict=True))
+        repeated = sum(int(count[count > 1].sum()) for count in counts)
+        statistics[f"repeated values, {attribute}"] = portion(repeated, numbers.size)
+        clusters = [_clusters(values.view(np.float32).astype(np.float64)) for values in numbers.T]
+        hits, trials = (sum(counted) for counted in zip(*clusters, strict=True))
         statistics[f"clusters of values, {attribute}"] = excess(hits, trials, _CLUSTERED)
     return statistics
 
@@ -198,10 +198,10 @@ def colours(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     channels = zip(("red", "green", "blue"), values.T, strict=True)
     inside = {f"{a} and {b}": np.abs(one - two) for (a, one), (b, two) in combinations(channels, 2)}
     usual = np.median(np.stack(list(inside.values())), axis=1).mean()
-    for name, each in inside.items():
+    for name, difference in inside.items():
         for quantile in _QUANTILES[:2]:
             statistics[f"{name}, {quantile}"] = Statistic(
-                float(np.log((np.quantile(each, quantile) + _TINY) / (usual + _TINY)))
+                float(np.log((np.quantile(difference, quantile) + _TINY) / (usual + _TINY)))
             )
     return statistics
 
@@ -267,3 +267,6 @@ def shapes_of(model: Gaussians) -> dict[str, Doubles]:
         part = model.sh[:, band**2 : (band + 1) ** 2].detach().cpu().double()
         shapes[f"harmonics of degree {band}"] = part.square().sum((1, 2)).clamp_min(1e-24).log().numpy()
     return shapes
+
+
+DETECTORS = (invariants, opacities, order, colours)

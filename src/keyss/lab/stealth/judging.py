@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,15 +12,11 @@ from scipy.special import stdtr
 from keyss.channels import DEEPEST
 from keyss.core import Gaussians, UsageError
 from keyss.core.arrays import Numbers
-from keyss.lab.stealth.attributes import colours, invariants, invisible_modes, opacities, order
-from keyss.lab.stealth.low_bits import agreement, bits, coincidences, steps
+from keyss.lab.stealth import attributes, low_bits
+from keyss.lab.stealth.attributes import invisible_modes
 from keyss.lab.stealth.statistic import BitPatterns, Statistic
 
-# Detectors by kind: functions of a model and its bit patterns that give statistics by name.
-KINDS: dict[str, Callable[[Gaussians, BitPatterns], dict[str, Statistic]]] = {
-    each.__name__: each
-    for each in (bits, agreement, coincidences, steps, invariants, opacities, order, colours)
-}
+DETECTORS = (*low_bits.DETECTORS, *attributes.DETECTORS)
 _AGREEMENT = 0.03  # relative error assumed for a statistic without a known error
 _MANY = 1e7  # degrees of freedom: normal
 
@@ -29,7 +25,7 @@ _MANY = 1e7  # degrees of freedom: normal
 class JudgedStatistic:
     """A statistic of the file, and of control models."""
 
-    name: str  # "kind: what is counted"
+    name: str  # "detector: what is counted"
     value: float
     low: float  # minimum of the controls
     high: float  # maximum of the controls
@@ -49,14 +45,14 @@ class StealthResult:
 
 
 def stealth_statistics(model: Gaussians) -> dict[str, Statistic]:
-    """Statistics of one file by "kind: name", if there is enough data; kinds are KINDS.
+    """Statistics of one file by "detector: name", if there is enough data.
 
     Takes half a second for 10,000 Gaussians.
     """
     words = BitPatterns.of(model)
     return {
-        f"{kind}: {name}": statistic
-        for kind, detect in KINDS.items()
+        f"{detect.__name__}: {name}": statistic
+        for detect in DETECTORS
         for name, statistic in detect(model, words).items()
         if not math.isnan(statistic.value)
     }
@@ -75,8 +71,8 @@ def judge(
     others = [stealth_statistics(model) for model in controls]
     rows = compare_statistics(own, others)
     of_controls = (
-        compare_statistics(each, others[:index] + others[index + 1 :])
-        for index, each in enumerate(others)
+        compare_statistics(control, others[:index] + others[index + 1 :])
+        for index, control in enumerate(others)
         if len(others) > 2
     )
     return StealthResult(
@@ -94,9 +90,9 @@ def compare_statistics(
     """The statistics that all models have, the least likely first."""
     models = [own, *controls]
     samples = {
-        name: [each[name] for each in controls]
+        name: [control[name] for control in controls]
         for name in own
-        if all(name in each and math.isfinite(each[name].value) for each in models)
+        if all(name in model and math.isfinite(model[name].value) for model in models)
     }
     # Variance of the statistics of bits between trainings / sampling variance.
     ratios = [
@@ -107,7 +103,7 @@ def compare_statistics(
     excess = max(1.0, float(np.mean(ratios))) if ratios else None
     rows = []
     for name, others in samples.items():
-        values = [each.value for each in others]
+        values = [statistic.value for statistic in others]
         p = _p(own[name], others, excess if name.startswith("bits: ") else None)
         rows.append(JudgedStatistic(name, own[name].value, min(values), max(values), p, own[name].p))
     return sorted(rows, key=lambda row: row.p)
@@ -126,7 +122,7 @@ def _p(own: Statistic, controls: Sequence[Statistic], excess: float | None) -> f
     `excess` gives its variance.
     """
     count = len(controls)
-    mean = float(np.mean([each.value for each in controls]))
+    mean = float(np.mean([statistic.value for statistic in controls]))
     distance = abs(own.value - mean)
     if distance == 0:
         return 1.0
@@ -144,17 +140,17 @@ def _p(own: Statistic, controls: Sequence[Statistic], excess: float | None) -> f
 
 
 def _between(controls: Sequence[Statistic]) -> float:
-    return float(np.var([each.value for each in controls], ddof=1))
+    return float(np.var([statistic.value for statistic in controls], ddof=1))
 
 
 def _sampling(controls: Sequence[Statistic]) -> float:
-    return float(np.mean([(each.error or 0.0) ** 2 for each in controls]))
+    return float(np.mean([(statistic.error or 0.0) ** 2 for statistic in controls]))
 
 
 def changed_low_bits(file: Gaussians, other: Gaussians) -> float:
     """Share of the Gaussians that have an equal in `other` except for low bits."""
-    own, theirs = (BitPatterns.of(model).bits for model in (file, other))
-    shared, same = (np.isin(_as_values(own >> low), _as_values(theirs >> low)) for low in (DEEPEST + 1, 0))
+    words, theirs = (BitPatterns.of(model).bits for model in (file, other))
+    shared, same = (np.isin(_as_values(words >> low), _as_values(theirs >> low)) for low in (DEEPEST + 1, 0))
     return float((shared & ~same).sum() / max(len(file), 1))
 
 

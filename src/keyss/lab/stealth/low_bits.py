@@ -78,14 +78,16 @@ def bits(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
         columns = words.of_attribute(index)
         own = words.bits[:, columns][words.trained[:, columns]]
         if len(own):
-            statistics |= {f"{name}, {attribute}": each for name, each in _of_values(own).items()}
+            statistics |= {f"{name}, {attribute}": statistic for name, statistic in _of_values(own).items()}
             statistics[f"strata of {attribute}"] = _strata(own)
     harmonics = words.attribute >= _HARMONICS
     own, trained = words.bits[:, harmonics], words.trained[:, harmonics]
     exponent = words.exponent[:, harmonics]
     for magnitude, (low, high) in MAGNITUDES.items():
         values = own[trained & (exponent >= low) & (exponent < high)]
-        statistics |= {f"{name}, {magnitude} harmonics": each for name, each in _of_values(values).items()}
+        statistics |= {
+            f"{name}, {magnitude} harmonics": statistic for name, statistic in _of_values(values).items()
+        }
     small = trained & (exponent < MAGNITUDES["middling"][1])
     statistics["zeros together in a Gaussian"] = _count_variance(own, small)
     tiny = (trained & (exponent < MAGNITUDES["tiny"][1])).any(axis=1)
@@ -158,15 +160,15 @@ def agreement(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     for name, attributes in _GROUPS.items():
         pairs = list(_pairs_within_gaussians(words, attributes))
         if pairs:
-            one, other = (np.concatenate(each) for each in zip(*pairs, strict=True))
-            statistics |= {f"{key}, {name}": each for key, each in _of_pairs(one, other).items()}
+            one, other = (np.concatenate(side) for side in zip(*pairs, strict=True))
+            statistics |= {f"{key}, {name}": statistic for key, statistic in _of_pairs(one, other).items()}
     harmless = words.attribute > 0
     for name, rows in (
         ("neighbours", nearest_pairs(doubles(model.means), _NEIGHBOURS)),
         ("sharers", _sharers(words)),
     ):
         one, other = (words.bits[rows[:, side]][:, harmless].ravel() for side in (0, 1))
-        statistics |= {f"{key}, {name}": each for key, each in _of_pairs(one, other).items()}
+        statistics |= {f"{key}, {name}": statistic for key, statistic in _of_pairs(one, other).items()}
     return statistics
 
 
@@ -201,11 +203,11 @@ def _pairs_within_gaussians(
 ) -> Iterator[tuple[Words32, Words32]]:
     """Pairs of magnitudes in one Gaussian, within a coefficient's channels or an attribute."""
     for attribute in attributes:
-        own = words.bits[:, words.of_attribute(attribute)] & np.uint32(0x7FFFFFFF)
-        if not own.size:
+        magnitudes = words.bits[:, words.of_attribute(attribute)] & np.uint32(0x7FFFFFFF)
+        if not magnitudes.size:
             continue
         width = 4 if attribute == 2 else 3
-        groups = own.reshape(len(own), -1, width)
+        groups = magnitudes.reshape(len(magnitudes), -1, width)
         for first, second in combinations(range(width), 2):
             yield groups[:, :, first].ravel(), groups[:, :, second].ravel()
 
@@ -241,17 +243,17 @@ def coincidences(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     counts: dict[str, tuple[int, int, int]] = {}
     for name, field, bits in _columns(words):
         low = np.uint32(((1 << bits) - 1) << 1)
-        own = words.bits[:, field]
+        numbers = words.bits[:, field]
         of_all, of_near, of_bright = f"all, {name}", f"neighbours, {name}", f"saturated, {name}"
         for kind, pairs, chosen in (
-            (of_all, _agreeing_pairs(own & ~low, _LAGS), usable),
+            (of_all, _agreeing_pairs(numbers & ~low, _LAGS), usable),
             (of_near, near, usable),
             (of_bright, bright, np.ones(len(usable), bool)),
         ):
             one, other = pairs[chosen[pairs].any(axis=1)].T
-            agree = (own[one] & ~low) == (own[other] & ~low)
+            agree = (numbers[one] & ~low) == (numbers[other] & ~low)
             equal, trials, _ = counts.get(kind, (0, 0, bits))
-            equal += int((own[one] == own[other])[agree].sum())
+            equal += int((numbers[one] == numbers[other])[agree].sum())
             counts[kind] = equal, trials + int(agree.sum()), bits
     return {name: excess(equal, trials, 2.0**-bits) for name, (equal, trials, bits) in counts.items()}
 
@@ -287,31 +289,33 @@ def steps(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     pairs = nearest_pairs(np.nan_to_num(doubles(model.means)), _STEP_NEIGHBOURS)
     usable = _usable(model)
     pairs = pairs[usable[pairs].any(axis=1)]
-    attribute, found = words.attribute, {}
+    attribute, statistics = words.attribute, {}
     groups = {"scales": words.bits[:, attribute == 1], "quaternions": words.bits[:, attribute == 2]}
     harmonics = words.bits[:, attribute >= _HARMONICS]
     colours = {f"harmonics, {name}": harmonics[:, index::3] for index, name in enumerate(_CHANNELS)}
     constants = doubles(model.sh[:, 0])
     drawn = np.random.default_rng(0)
-    for name, own in {**groups, **colours}.items():
-        if own.shape[1]:
-            found[f"equal steps of two {name}"] = _excess(own, usable, drawn, *_two_equal(own, pairs))
+    for name, numbers in {**groups, **colours}.items():
+        if numbers.shape[1]:
+            statistics[f"equal steps of two {name}"] = _excess(
+                numbers, usable, drawn, *_two_equal(numbers, pairs)
+            )
     for ratio in _RATIOS if model.sh_degree else ():
         for least in _AGREE:
-            for index, own in enumerate(colours.values()):
+            for index, numbers in enumerate(colours.values()):
                 moved = np.abs(constants[pairs[:, 0], index] - constants[pairs[:, 1], index]) / ratio
                 name = f"{least} or more follow the constant colour, ratio {ratio}, {_CHANNELS[index]}"
-                found[name] = _excess(own, usable, drawn, *_follow(own, pairs, moved, least))
-    return found
+                statistics[name] = _excess(numbers, usable, drawn, *_follow(numbers, pairs, moved, least))
+    return statistics
 
 
 # Pairs, columns, steps or 0, other columns, cells.
-_Found = tuple[Integers, Integers, Doubles, Integers, Doubles]
+_Candidates = tuple[Integers, Integers, Doubles, Integers, Doubles]
 
 
-def _two_equal(own: Words32, pairs: Integers) -> _Found:
+def _two_equal(own: Words32, pairs: Integers) -> _Candidates:
     """Pairs of columns of `own` [N, C] whose differences agree, as far as the bits that stay tell."""
-    middle, cells, found = _middle(own), _cells(own), []
+    middle, cells, candidates = _middle(own), _cells(own), []
     for start in range(0, len(pairs), _PAIRS):
         one, other = pairs[start : start + _PAIRS].T
         moved, cell = np.abs(middle[one] - middle[other]), np.maximum(cells[one], cells[other])
@@ -319,25 +323,25 @@ def _two_equal(own: Words32, pairs: Integers) -> _Found:
             span = np.maximum(cell[:, a], cell[:, b])
             rows = np.flatnonzero((np.abs(moved[:, a] - moved[:, b]) <= span) & (moved[:, a] > 2 * span))
             columns = np.full(len(rows), a), np.full(len(rows), b)
-            found.append((pairs[start + rows], columns[0], np.zeros(len(rows)), columns[1], span[rows]))
-    return _joined(found)
+            candidates.append((pairs[start + rows], columns[0], np.zeros(len(rows)), columns[1], span[rows]))
+    return _joined(candidates)
 
 
-def _follow(own: Words32, pairs: Integers, moved: Doubles, least: int) -> _Found:
+def _follow(own: Words32, pairs: Integers, moved: Doubles, least: int) -> _Candidates:
     """Columns of `own` [N, C] whose differences agree with `moved` [P], where `least` or more do."""
-    middle, cells, found = _middle(own), _cells(own), []
+    middle, cells, candidates = _middle(own), _cells(own), []
     for start in range(0, len(pairs), _PAIRS):
         (one, other), steps = pairs[start : start + _PAIRS].T, moved[start : start + _PAIRS, None]
         cell = np.maximum(cells[one], cells[other])
         near = (np.abs(np.abs(middle[one] - middle[other]) - steps) <= 1.5 * cell) & (steps > 2 * cell)
         rows, columns = np.nonzero(near & (near.sum(axis=1) >= least)[:, None])
-        found.append((pairs[start + rows], columns, steps[rows, 0], columns, cell[rows, columns]))
-    return _joined(found)
+        candidates.append((pairs[start + rows], columns, steps[rows, 0], columns, cell[rows, columns]))
+    return _joined(candidates)
 
 
-def _joined(found: list[_Found]) -> _Found:
+def _joined(candidates: list[_Candidates]) -> _Candidates:
     index, number = np.zeros(0, np.int64), np.zeros(0)
-    every = [(np.zeros((0, 2), np.int64), index, number, index, number), *found]
+    every = [(np.zeros((0, 2), np.int64), index, number, index, number), *candidates]
     return tuple(np.concatenate(each)[:_MAX_DIFFERENCES] for each in zip(*every, strict=True))  # type: ignore[return-value]
 
 
@@ -381,3 +385,6 @@ def _cells(words: Words32) -> Doubles:
     """The range of each number's low bits."""
     powers = (words & np.uint32(0x7F800000)).view(np.float32).astype(np.float64)
     return powers * 2.0 ** (DEEPEST + 1 - MANTISSA)
+
+
+DETECTORS = (bits, agreement, coincidences, steps)

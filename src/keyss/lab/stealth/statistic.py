@@ -32,7 +32,7 @@ class BitPatterns:
     def of(model: Gaussians) -> BitPatterns:
         fields = [model.means, model.log_scales, model.quats, model.opacity_logits[:, None]]
         fields += [model.sh[:, band**2 : (band + 1) ** 2].flatten(1) for band in range(model.sh_degree + 1)]
-        parts = [each.detach().cpu().float().contiguous().numpy().view(np.uint32) for each in fields]
+        parts = [field.detach().cpu().float().contiguous().numpy().view(np.uint32) for field in fields]
         attribute = np.repeat(np.arange(len(parts)), [part.shape[1] for part in parts])
         return BitPatterns(np.concatenate(parts, axis=1), attribute)
 
@@ -55,7 +55,7 @@ class BitPatterns:
 
 def ulps(one: Words32, other: Words32) -> Integers:
     """Distance of numbers in units in the last place; 2^31 if their signs differ."""
-    a, b = (each & 0x7FFFFFFF for each in (one, other))
+    a, b = (words & 0x7FFFFFFF for words in (one, other))
     distance = np.abs(a.astype(np.int64) - b.astype(np.int64))
     return np.where((one ^ other) >> 31 == 0, distance, np.int64(1) << 31)
 
