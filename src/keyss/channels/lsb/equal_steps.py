@@ -4,11 +4,14 @@ Adam's steps do not depend on the size of a gradient. While one of two siblings,
 control split, is seen alone, or both in one direction, all harmonics of a colour move apart by the same
 amount. The same holds for the distance from zero, where harmonics start, and for scales and for quaternions.
 Constant colours, which are never written, move by the same amount times the ratio of two learning rates.
+While two colours of a Gaussian are wrong by the same factor, the harmonics of both move together.
 
 A Gaussian is left alone if three numbers of a group (the harmonics of a colour, a quaternion, or scales and
-opacity) moved by equal amounts away from zero or from one of its nearest neighbours, up to the precision of
-the bits that stay at all depths. No rate of a trainer is assumed. By chance two agree in many Gaussians;
-whether these predict low bits is tested on each model, at each depth.
+opacity) moved by equal amounts away from zero, from another of its colours or from one of its nearest
+neighbours, up to the precision of the bits that stay. Halves of a large Gaussian may be far apart: they are
+found by sums and differences of three numbers, which equal steps leave alone. No rate of a trainer is
+assumed. By chance two agree in many Gaussians; whether these predict low bits is tested on each model, at
+each depth.
 """
 
 from __future__ import annotations
@@ -18,22 +21,26 @@ from typing import Any
 import numpy as np
 import torch
 
-from keyss.channels.lsb.bits import LEAST, Layout, bit_patterns
+from keyss.channels.lsb.bits import LEAST, LOW, Layout, bit_patterns
 from keyss.core.arrays import Flags, Integers, Words32, doubles
 from keyss.core.gaussians import Gaussians
-from keyss.core.neighbours import Neighbours
+from keyss.core.neighbours import Neighbours, nearest_neighbours
 from keyss.files.formats.common import morton_order
 from keyss.kernels.jit import inline, kernel
 from keyss.kernels.parallel import in_blocks
 
 _NEIGHBOURS = 12  # siblings were among the nearest 10 in models of 20,000 to 200,000 Gaussians
 _EQUAL = 3  # numbers
+_ALIKE = 2  # nearest in each of the sums and differences
+_MANY_EQUAL = 5  # harmonics, or all, of Gaussians that were found by three
 _ROWS = 1 << 11  # that a thread takes at a time
 _SAMPLE = 8000  # Gaussians whose pairs of numbers are tested
 _DRAWS = 16
 _PARTS = np.array([[1 / 16], [1 / 8], [1 / 4]])  # of a cell
+_ZERO, _COLOURS = -1, -2  # what a Gaussian is compared with, before its neighbours
+_GEOMETRY, _HARMONICS, _BETWEEN_COLOURS = _KINDS = 0, 1, 2
 _LANES = 16  # of a group: as many as a processor compares at once
-_NAN, _EXPONENT = np.uint32(0x7FC00000), np.uint32(0x7F800000)
+_NAN, _EXPONENT, _MAGNITUDE = np.uint32(0x7FC00000), np.uint32(0x7F800000), np.uint32(0x7FFFFFFF)
 
 
 class Steps:
@@ -55,6 +62,7 @@ class Steps:
                 self.near[rows] = tree.of(means[rows])[1][:, 1:]
 
             in_blocks(search, len(means), _ROWS)
+        self.alike = _alike(*self.words)
 
     def equal(self, depth: int, among: Flags | None = None) -> Flags:
         """Mask [N] of Gaussians that moved by equal amounts, by the bits that stay at a depth.
@@ -65,7 +73,9 @@ class Steps:
         apart = np.zeros(len(self.order), bool)
 
         def mark(start: int, stop: int) -> None:
-            _mark(rows[start:stop], self.near, *self.words, depth, apart)
+            own = rows[start:stop]
+            _mark(own, self.near, *self.words, depth, _COLOURS, _EQUAL, apart)
+            _mark(own, self.alike, *self.words, depth, 0, _MANY_EQUAL, apart)
 
         in_blocks(mark, len(rows), _ROWS, _mark)
         return apart
@@ -84,21 +94,21 @@ class Steps:
         while count == len(found):
             found = np.empty((2 * len(found) + len(rows) + 1, 7), np.uint32)
             count = _pairs(rows, self.near, *self.words, depth, found)
-        harmonics = found[:count, 6] > 0
-        for kind in (~harmonics, harmonics):
-            words, pairs = found[:count, :4][kind], found[:count, 4:6][kind]
+        for kind in _KINDS:
+            own = found[:count][found[:count, 6] == kind]
+            words, pairs = own[:, :4], own[:, 4:6]
             written = usable[np.tile(pairs, 2)]
             hits, drawn = _hits(words, depth), np.zeros(len(_PARTS))
             for _ in range(_DRAWS):
                 drawn += _hits(redrawn(words, written, depth, random), depth)
             chances += pdtrc(hits - 1.0, np.maximum(drawn, 1) / _DRAWS)[hits > 0].tolist()
-        return min(1.0, min(chances) * 2 * len(_PARTS))
+        return min(1.0, min(chances) * len(_KINDS) * len(_PARTS))
 
 
 def moved_from_zero(gaussians: Gaussians, layout: Layout) -> Flags:
     """Mask [N] of Gaussians whose numbers moved by equal amounts away from zero, at the least depth."""
     apart, none = np.zeros(len(gaussians), bool), np.empty((len(gaussians), 0), np.int32)
-    _mark(np.arange(len(apart)), none, *_words(gaussians, layout), LEAST, apart)
+    _mark(np.arange(len(apart)), none, *_words(gaussians, layout), LEAST, _ZERO, _EQUAL, apart)
     return apart
 
 
@@ -119,7 +129,23 @@ def _words(gaussians: Gaussians, layout: Layout) -> tuple[Words32, Words32]:
     if layout.quats:
         geometry = torch.cat([geometry, gaussians.quats[:, :, None]], dim=2)
     sh = gaussians.sh
-    return bit_patterns(geometry).reshape(*geometry.shape), bit_patterns(sh).reshape(*sh.shape)
+    return bit_patterns(geometry).reshape(geometry.shape), bit_patterns(sh).reshape(sh.shape)
+
+
+def _alike(geometry: Words32, sh: Words32) -> Integers:
+    """[N, 4 _ALIKE] Gaussians with nearly equal sums or differences of three numbers, for all signs of steps.
+
+    The numbers are the mean harmonics of degree 1 or, at SH degree 0, the log scales.
+    """
+    numbers = (sh[:, 1:4] if sh.shape[1] > 1 else geometry[:, :3, :1]) & ~LOW
+    means = np.nan_to_num(numbers.view(np.float32).astype(np.float64), posinf=0, neginf=0).mean(axis=2)
+    kept = [means[:, :1] - means[:, 1:] * signs for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
+    count = min(_ALIKE, max(0, len(means) - 1))
+    near = [np.empty((len(means), 0), np.int64)]
+    if count:
+        near += in_blocks(lambda index, _: nearest_neighbours(kept[index], count + 1)[1][:, 1:], len(kept), 1)
+    alike: Integers = np.concatenate(near, axis=1)
+    return alike
 
 
 def _hits(words: Words32, depth: int) -> Integers:
@@ -144,6 +170,17 @@ def _read(geometry: Any, sh: Any, row: Any, words: Any) -> None:
 
 
 @inline
+def _rotate(x: Any, y: Any, quats: Any) -> None:
+    """Set `y` [groups, _LANES] to the next colours of x, with its signs; geometry is equal to nothing."""
+    for group in range(len(x)):
+        source = quats + (group - quats + 1) % 3
+        for at in range(_LANES):
+            y[group, at] = _NAN
+            if group >= quats:
+                y[group, at] = x[source, at] & _MAGNITUDE | x[group, at] & ~_MAGNITUDE
+
+
+@inline
 def _compare(x: Any, y: Any, depth: Any, known: Any, steps: Any, cells: Any) -> None:
     """Set `steps` [groups, _LANES] to the differences of x and y by the bits that stay at a depth.
 
@@ -163,16 +200,21 @@ def _compare(x: Any, y: Any, depth: Any, known: Any, steps: Any, cells: Any) -> 
 
 
 @kernel
-def _mark(rows: Any, near: Any, geometry: Any, sh: Any, depth: int, apart: Any) -> None:
-    """Set `apart` [N] for pairs of a row and one of its neighbours in `near` [N, K], or zero."""
+def _mark(
+    rows: Any, near: Any, geometry: Any, sh: Any, depth: int, first: int, least: int, apart: Any
+) -> None:
+    """Set `apart` [N] for pairs of a row and one of its neighbours in `near` [N, K].
+
+    `least`: equal steps of harmonics. `first`: what comes before neighbours, _COLOURS and _ZERO, _ZERO, or 0
+    for neither.
+    """
     groups = geometry.shape[2] + 3 * (sh.shape[1] > 1)
     x = np.full((groups, _LANES), _NAN, np.uint32)  # unused lanes are equal to nothing
     y, known = np.zeros((groups, _LANES), np.uint32), np.empty((3, groups, _LANES), np.uint32)
     steps, cells = np.empty((groups, _LANES), np.float32), np.empty((groups, _LANES), np.float32)
     for one in rows:
         _read(geometry, sh, one, x)
-        y[:] = 0
-        for place in range(-1, near.shape[1]):
+        for place in range(first, near.shape[1]):
             other = one if place < 0 else near[one, place]
             if (apart[one] and apart[other]) or (place >= 0 and other == one):
                 continue
@@ -183,6 +225,10 @@ def _mark(rows: Any, near: Any, geometry: Any, sh: Any, depth: int, apart: Any) 
                 continue
             if place >= 0:
                 _read(geometry, sh, other, y)
+            elif place == _ZERO:
+                y[:] = 0
+            else:
+                _rotate(x, y, geometry.shape[2])
             _compare(x, y, depth, known, steps, cells)
             for group in range(groups):
                 most = np.int32(0)
@@ -192,7 +238,8 @@ def _mark(rows: Any, near: Any, geometry: Any, sh: Any, depth: int, apart: Any) 
                         cell = max(cells[group, at], cells[group, each])
                         agree += np.int32(abs(steps[group, at] - steps[group, each]) <= cell)
                     most = max(most, agree)
-                if most >= _EQUAL:
+                enough = _EQUAL if group < geometry.shape[2] else min(least, sh.shape[1] - 1)
+                if most >= enough:
                     apart[one] = apart[other] = True
                     break
 
@@ -201,8 +248,8 @@ def _mark(rows: Any, near: Any, geometry: Any, sh: Any, depth: int, apart: Any) 
 def _pairs(rows: Any, near: Any, geometry: Any, sh: Any, depth: int, found: Any) -> int:
     """List pairs of numbers that differ by equal steps between `rows` and their neighbours; how many.
 
-    `found` [M, 7]: one number of row and neighbour, the other one, row and neighbour, 1 for harmonics. Lists
-    at most M. Steps of up to two cells do not count: many are that small by chance.
+    The next colour counts as a neighbour. `found` [M, 7]: first number of row and neighbour, second number,
+    row and neighbour, kind. Lists at most M. Steps of up to two cells are small by chance.
     """
     groups, count = geometry.shape[2] + 3 * (sh.shape[1] > 1), 0
     x, y = np.full((groups, _LANES), _NAN, np.uint32), np.zeros((groups, _LANES), np.uint32)
@@ -210,10 +257,14 @@ def _pairs(rows: Any, near: Any, geometry: Any, sh: Any, depth: int, found: Any)
     steps, cells = np.empty((groups, _LANES), np.float32), np.empty((groups, _LANES), np.float32)
     for one in rows:
         _read(geometry, sh, one, x)
-        for other in near[one]:
-            if other <= one:  # each pair counts once
+        for place in range(-1, near.shape[1]):
+            other = one if place < 0 else near[one, place]
+            if place < 0:
+                _rotate(x, y, geometry.shape[2])
+            elif other <= one:  # each pair counts once
                 continue
-            _read(geometry, sh, other, y)
+            else:
+                _read(geometry, sh, other, y)
             _compare(x, y, depth, known, steps, cells)
             for group in range(groups):
                 for at in range(_LANES):
@@ -226,6 +277,8 @@ def _pairs(rows: Any, near: Any, geometry: Any, sh: Any, depth: int, found: Any)
                             row = found[count]
                             row[0], row[1] = x[group, at], y[group, at]
                             row[2], row[3] = x[group, each], y[group, each]
-                            row[4], row[5], row[6] = one, other, group >= geometry.shape[2]
+                            row[4], row[5], row[6] = one, other, _GEOMETRY
+                            if group >= geometry.shape[2]:
+                                row[6] = _HARMONICS if place >= 0 else _BETWEEN_COLOURS
                             count += 1
     return count

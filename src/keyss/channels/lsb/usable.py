@@ -3,16 +3,19 @@
 In a trained model most low bits are uniformly random to anybody who does not know the training, but not all.
 A Gaussian is excluded as a whole, so that its numbers stay consistent, because of:
 
-- *Equal steps* away from zero or a neighbour: see `equal_steps`. These are also the harmonics of Gaussians
-  that no view shows, and numbers that training freezes in clones.
+- *Equal steps* away from zero, a sibling or another colour: see `equal_steps`. These are also the harmonics
+  of Gaussians that no view shows, and numbers that training freezes in clones.
 - *Copies*: Gaussians that share their position, scales, quaternion or the harmonics of degree 1 of a colour
   with any other one, and values that occur too often.
 - *Nearly equal* scales, or colours of a harmonic: round and grey Gaussians.
 - *Opacities* whose sigmoid is 1, which have no gradient, and those at the edge below which trainers remove
   Gaussians: no trained model has smaller ones.
+- *Unit quaternions* among others, as in merged models: new bits would change their length.
+- *Short numbers*, five in a Gaussian, as of models in half precision.
 - *Small even numbers*, which an optimiser may have left on a coarser grid: see `trailing_zeros`.
 
-All but the last are found in bits that embedding never changes. docs/threat-model.md tells what each hides.
+All but the last two are found in bits that embedding never changes. docs/threat-model.md tells what each
+hides.
 
 A *salt* of Argon2id is a hash of one Gaussian and its low bits, which are new random bits for every file and
 carry nothing else: no two files of one cover share a salt. There are several salts because Gaussians may be
@@ -37,7 +40,9 @@ from keyss.channels.lsb.bits import (
     LEAST,
     LOW,
     QUATS,
+    UNIT_TOLERANCE,
     Layout,
+    coarse_lengths,
     gaussian_ids,
     group_words,
     read_low_bits,
@@ -72,6 +77,7 @@ _PRUNED = np.float32(math.log(0.005 / 0.995)).view(np.uint32) | LOW  # the logit
 _MIN_USABLE = 0.05  # share of the Gaussians of a cover
 _LARGE_ENOUGH = 118  # biased exponent: optimisers with large last steps leave zeros in numbers below 2^-9
 _FIRST = 1 << 12  # Gaussians of the smallest IDs, of which most models have enough for salts
+_SHORT = 5  # numbers without low bits; by chance in one of ten million Gaussians
 _SETS_BY_CHANCE = 0.1  # maximum expected number of sets of equal values by chance
 _SAMPLE = 20_000  # Gaussians whose bits are tested
 _LARGE = 10 * _SAMPLE  # Gaussians of a cover whose sample is tested first
@@ -90,7 +96,7 @@ class Carriers:
     def of(gaussians: Gaussians, layout: Layout) -> Carriers:
         """Raises UsageError, with what shows, if new low bits would show even at the least depth.
 
-        A sample of a large cover is tested first: the whole takes a second for each 200,000 Gaussians.
+        A sample of a large cover is tested first: the whole takes a second for each 50,000 Gaussians.
         """
         if len(gaussians) > _LARGE:
             sample = gaussians[:: len(gaussians) // _SAMPLE]
@@ -226,7 +232,8 @@ def _exponents(words: Words32) -> Bytes:
 
 
 def _without_copies(gaussians: Gaussians, layout: Layout, ids: Bytes) -> Flags:
-    """Mask [N] of Gaussians without shared, frequent, nearly equal, saturated and nearly pruned numbers."""
+    """Mask [N] of Gaussians without shared, frequent, nearly equal, saturated, nearly pruned, short and unit
+    numbers."""
     shared = [slice(0, 3), *([QUATS] if layout.quats else [])]
     if layout.sh_degree:
         shared += [slice(GEOMETRY + colour, GEOMETRY + 9, 3) for colour in range(3)]
@@ -249,6 +256,9 @@ def _without_copies(gaussians: Gaussians, layout: Layout, ids: Bytes) -> Flags:
         triples = np.concatenate([high[:, :3], high[:, GEOMETRY:]], axis=1).reshape(len(used), -1, 3)
         near = np.abs(triples - triples[:, :, [1, 2, 0]]) <= 1
         fine[start:stop] = good[:, layout.columns].all(axis=1) & ~near.any(axis=(1, 2))
+        fine[start:stop] &= (used[:, layout.columns] & LOW == 0).sum(axis=1) < _SHORT
+        if layout.quats:
+            fine[start:stop] &= np.abs(coarse_lengths(used[:, QUATS]) - 1) > UNIT_TOLERANCE
 
     in_blocks(judge, len(gaussians), BLOCK)
     unique: Flags = ~np.logical_or.reduce(in_blocks(lambda index, _: repeated(keys[index]), len(keys), 1))

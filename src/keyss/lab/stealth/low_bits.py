@@ -10,9 +10,10 @@
   Embedding makes their other bits random, unless neither Gaussian is a carrier. The null for pairs with a
   usable Gaussian is exact: independent low bits.
 - `steps`: siblings that moved apart by equal steps of Adam, so that numbers predict each other's low bits
-  (`keyss.channels.lsb.equal_steps`). A hit is a difference between neighbours that agrees to 1/8 of a cell
-  (the range of low bits) with that of another number of its group, or with that of the constant colour
-  divided by the ratio of their rates. Candidates are found by the bits that stay. The null distribution comes
+  (`keyss.channels.lsb.equal_steps`). A hit is a difference between neighbours, or between two colours, that
+  agrees to 1/8 of a cell (the range of low bits) with that of another number of its group, or with that of
+  the constant colour divided by the ratio of their rates. Neighbours are near in space or agree in sums and
+  differences of three harmonics. Candidates are found by the bits that stay. The null distribution comes
   from the same file with other low bits in usable Gaussians.
 """
 
@@ -62,6 +63,7 @@ _LAGS = 4  # maximum distance of pairs in the order of their high bits
 _NEAREST = 16
 _SATURATED = 16.0  # logit
 
+_MAGNITUDE = np.uint32(0x7FFFFFFF)
 _LOW_MASK = np.uint32((1 << DEEPEST + 1) - 1)
 _STEP_NEIGHBOURS = 12
 _RATIOS = (20, 10, 5, 1)  # learning rate of constant colours / harmonics, in common trainers
@@ -288,11 +290,16 @@ def steps(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     """Hits beyond those after new draws of the low bits of usable Gaussians, in standard deviations."""
     pairs = nearest_pairs(np.nan_to_num(doubles(model.means)), _STEP_NEIGHBOURS)
     usable = _usable(model)
-    pairs = pairs[usable[pairs].any(axis=1)]
     attribute, statistics = words.attribute, {}
     groups = {"scales": words.bits[:, attribute == 1], "quaternions": words.bits[:, attribute == 2]}
     harmonics = words.bits[:, attribute >= _HARMONICS]
     colours = {f"harmonics, {name}": harmonics[:, index::3] for index, name in enumerate(_CHANNELS)}
+    for numbers in colours.values() if model.sh_degree else ():
+        one, *others = _middle(numbers[:, :3]).T
+        for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+            kept = np.stack([one - sign * other for sign, other in zip(signs, others, strict=True)], axis=1)
+            pairs = np.concatenate([pairs, nearest_pairs(np.nan_to_num(kept), 1)])
+    pairs = np.unique(pairs[usable[pairs].any(axis=1)], axis=0)
     constants = doubles(model.sh[:, 0])
     drawn = np.random.default_rng(0)
     for name, numbers in {**groups, **colours}.items():
@@ -300,6 +307,12 @@ def steps(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
             statistics[f"equal steps of two {name}"] = _excess(
                 numbers, usable, drawn, *_two_equal(numbers, pairs)
             )
+    if model.sh_degree:
+        rows = np.flatnonzero(usable.repeat(3))
+        both = np.stack([rows, rows - rows % 3 + (rows + 1) % 3], axis=1)
+        numbers = np.stack(list(colours.values()), axis=1).reshape(3 * len(model), -1) & _MAGNITUDE
+        equal = _excess(numbers, usable.repeat(3), drawn, *_two_equal(numbers, both))
+        statistics["equal steps of two harmonics, two colours"] = equal
     for ratio in _RATIOS if model.sh_degree else ():
         for least in _AGREE:
             for index, numbers in enumerate(colours.values()):
