@@ -141,9 +141,17 @@ def _alike(geometry: Words32, sh: Words32) -> Integers:
     means = np.nan_to_num(numbers.view(np.float32).astype(np.float64), posinf=0, neginf=0).mean(axis=2)
     kept = [means[:, :1] - means[:, 1:] * signs for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
     count = min(_ALIKE, max(0, len(means) - 1))
+
+    def search(index: int, _: int) -> Integers:
+        flat = np.pad(kept[index], ((0, 0), (0, 1))).astype(np.float32)
+        order = morton_order(flat)  # what neighbours share stays in the cache
+        found = np.empty((len(order), count), np.int64)
+        found[order] = order[nearest_neighbours(kept[index][order], count + 1)[1][:, 1:]]
+        return found
+
     near = [np.empty((len(means), 0), np.int64)]
     if count:
-        near += in_blocks(lambda index, _: nearest_neighbours(kept[index], count + 1)[1][:, 1:], len(kept), 1)
+        near += in_blocks(search, len(kept), 1)
     alike: Integers = np.concatenate(near, axis=1)
     return alike
 
