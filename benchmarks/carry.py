@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from keyss import read_model
 from codes import against_photos
-from keyss.channels import DEPTHS, LEAST, TYPICAL_SHARE, Layout, LowBitsCapacity, usable_carriers
+from keyss.channels import DEPTHS, TYPICAL_SHARE, Layout, LowBitsCapacity, usable_carriers
 from keyss.core import Gaussians, KeyssError, Scene
 from keyss.files import load_scene
 from keyss.fitting import psnr
@@ -49,8 +49,7 @@ def _capacities() -> None:
         for quats in (True, False):
             layout, carriers = Layout(degree, quats), int(TYPICAL_SHARE * 100_000)
             sizes = [
-                LowBitsCapacity(100_000, {LEAST: carriers, depth: carriers}, layout).payload_capacity(1)
-                for depth in DEPTHS
+                LowBitsCapacity(100_000, carriers, layout, (depth,)).payload_capacity(1) for depth in DEPTHS
             ]
             name = "" if quats else ", unit quaternions"
             print(f"  degree {degree}{name}: " + ", ".join(f"{size / 100_000:.1f}" for size in sizes))

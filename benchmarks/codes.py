@@ -1,4 +1,4 @@
-"""Capacity and cost of carrying in the codes of published files: the tables of docs/channels.md.
+"""Capacity and cost of carrying in quantised values: the tables of docs/channels.md.
 
     python benchmarks/codes.py --data FOLDER --pair bonsai=cover.ply,fox=secret.ply --write docs/channels.md
     python benchmarks/codes.py --files FOLDER --format spz bonsai=a.ply bonsai=b.ply fox=c.ply ...
@@ -19,8 +19,7 @@ import os
 import time
 from pathlib import Path
 
-from keyss.channels import SUFFIXES, InCodes, Payload
-from keyss.channels.lsb.blocks import BlockReader
+from keyss.channels import SUFFIXES, Payload, QuantisedChannel, QuantisedReader
 from keyss.channels.lsb.fields import FORMATS
 from keyss.core import Gaussians, Scene
 from keyss.files import write_bytes
@@ -64,15 +63,15 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
         model = in_morton_order(cover[1])
         untouched = format_.quantise(model).dequantise()
         start = time.monotonic()
-        prepared = InCodes(name).prepare(cover[1])
-        left = prepared.capacity.bytes - prepared.capacity.overhead
+        prepared = QuantisedChannel(name).prepare(cover[1])
+        left = prepared.capacity.bytes
         kept = prune_to_size(own, left)
         encoded = encode_to_size(kept, left)
         stego = prepared.embed([(KEY, Payload("carry", encoded))])
         file = stego.codes.serialise()
         hiding = time.monotonic() - start
         start = time.monotonic()
-        opened = decode(BlockReader.of(format_.parse(file)).open(KEY).data)
+        opened = decode(QuantisedReader.of(format_.parse(file)).open(KEY).data)
         revealing = time.monotonic() - start
         bits = 8 * left / len(model)
         most = 8 * left / (8 * len(encode(kept)) / len(kept)) / len(model)
@@ -96,7 +95,7 @@ def files(folder: Path, format_name: str, models: list[str]) -> None:
     found = []
     for each in models:
         scene, _, path = each.partition("=")
-        cover = InCodes(format_name).prepare(read_model(path))
+        cover = QuantisedChannel(format_name).prepare(read_model(path))
         plain, stego = (
             folder / f"{Path(path).stem}-{kind}{SUFFIXES[format_name]}" for kind in ("plain", "stego")
         )

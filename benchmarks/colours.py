@@ -102,7 +102,7 @@ def _try_payload(
     others: Mapping[str, Change],
 ) -> dict[str, Any]:
     """Hide a payload, and open it after each change."""
-    data = np.random.default_rng(number).bytes(size or cover.capacity.bytes - PACKED)
+    data = np.random.default_rng(number).bytes(size or cover.planner.bytes - PACKED)
     stego = _embed(cover, number, data)
     opened: dict[str, bool] = {}
     for what, change in {**formats, **others}.items():
@@ -159,7 +159,7 @@ def _write_pairs(models: Sequence[Path], folder: Path, shares: Sequence[float], 
         scene, prepared = path.stem.rsplit("-", 1)[0], COLOURS.prepare(read_model(path))
         made = {"plain": prepared.cover}
         for share in shares:
-            size = int(share * (prepared.capacity.bytes - PACKED))
+            size = int(share * (prepared.planner.bytes - PACKED))
             data = np.random.default_rng(number).bytes(size)
             stego = made[f"{share:g}"] = _embed(prepared, number, data)
             print(

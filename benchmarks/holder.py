@@ -2,7 +2,7 @@
 
     python benchmarks/holder.py bonsai=a.ply bonsai=b.ply fox=c.ply ...   # plain, of three scenes or more
 
-In each model, a secret is hidden alone and beside one to three others. The holder opens it, tries every cell
+In each model, a secret is hidden alone and beside one to three others. The holder opens it, tries every shard
 of the file with the key (`tests/channels/lsb/holder.py`), and computes the statistics of
 `keyss.lab.stealth`. Detectors are cross-validated over scenes.
 """

@@ -2,9 +2,10 @@
 
     python benchmarks/survival.py MODEL.ply [--bytes N] [--gaussians N] [--photos FOLDER] [--width PIXELS]
 
-A file of random bytes is hidden in a `.ply` (low bits) and an `.spz` (codes), and for `--publish converted`
-(colours and appended Gaussians). After each change, its key is tried. With `--photos` of its scene, the model
-is also fine-tuned. Argon2id is replaced by a cheap function, which does not affect the result.
+A file of random bytes is hidden in a `.ply` (low bits) and an `.spz` (quantised values), and for `--publish
+converted` (colours and appended Gaussians). After each change, its key is tried. With `--photos` of its
+scene, the model is also fine-tuned. Argon2id is replaced by a cheap function, which does not affect the
+result.
 
 pip install gsply npm install --no-save @playcanvas/splat-transform@2.7.1   (or KEYSS_SPLAT_TRANSFORM)
 """
@@ -26,7 +27,7 @@ import numpy as np
 KEY = "a key of the benchmark 4711"
 CHANNELS = {
     "low bits (`ply`)": CarryOptions(publish="unchanged"),
-    "codes (`spz`)": CarryOptions(format="spz"),
+    "quantised values (`spz`)": CarryOptions(format="spz"),
     "colours (`converted`)": CarryOptions(publish="converted", channel="colours"),
     "appended (`converted`)": CarryOptions(publish="converted"),
 }

@@ -14,7 +14,7 @@ import pytest
 
 from channels.lsb.trained_like import trained_like
 from cli.harness import SMALL, write_workspace
-from keyss.channels import LsbReader
+from keyss.channels import LowBitsReader
 from keyss.cli import command_table, entry, main
 from keyss.core import KeyssError
 from keyss.keys import DerivedKey
@@ -123,5 +123,5 @@ def test_repr_and_errors_omit_key() -> None:
     assert KEY not in repr(derived)
     assert derived.expand("writer", 32).hex() not in repr(derived)
     with pytest.raises(KeyssError) as caught:
-        LsbReader.of(trained_like(50)).open(KEY)
+        LowBitsReader.of(trained_like(50)).open(KEY)
     assert not _contains_key(str(caught.value).encode())

@@ -14,7 +14,7 @@ import keyss
 from channels.lsb.trained_like import trained_like
 from fitting.test_plain import InterruptAt
 from keyss import CarryOptions, FitConfig, Gaussians, Secret
-from keyss.channels import AppendedReader, LsbReader, is_appended
+from keyss.channels import AppendedReader, LowBitsReader, is_appended
 from keyss.core import Interrupted, OutputError, WrongKeyError
 from keyss.keys import DerivedKey, derivation
 from keyss.methods import MethodOptions
@@ -79,13 +79,13 @@ def test_salts_differ_for_equal_seeds(options: MethodOptions) -> None:
         stegos.append(hidden.stego)
     common = salts[0] & salts[1]
     for own, stego in zip(salts, stegos, strict=True):
-        readers = [each for each in (LsbReader.of(stego), AppendedReader.of(stego)) if each]
+        readers = [each for each in (LowBitsReader.of(stego), AppendedReader.of(stego)) if each]
         assert common <= {salt for each in readers for salt in each.salts}
         assert not any(_opens(each, salt) for each in readers for salt in common)
         assert any(_opens(each, salt) for each in readers for salt in own)
 
 
-def _opens(reader: LsbReader | AppendedReader, salt: bytes) -> bool:
+def _opens(reader: LowBitsReader | AppendedReader, salt: bytes) -> bool:
     try:
         reader.extract(DerivedKey.of(KEY, salt))
     except WrongKeyError:

@@ -23,14 +23,11 @@ sys.path.insert(0, str(FOLDER.parent))
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from argon2.low_level import Type, hash_secret_raw  # noqa: E402
-from cryptography.hazmat.primitives.ciphers import Cipher  # noqa: E402
-from cryptography.hazmat.primitives.ciphers.algorithms import AES  # noqa: E402
-from cryptography.hazmat.primitives.ciphers.modes import CBC, ECB  # noqa: E402
 from cryptography.hazmat.primitives.hashes import SHA256  # noqa: E402
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
-from channels.lsb import coded  # noqa: E402
+from channels.lsb import quantised  # noqa: E402
 from channels.lsb.trained_like import trained_like  # noqa: E402
 from files.formats.examples import model_of, random_compressed, random_sog, random_spz  # noqa: E402
 from keyss.channels import LOW_BITS, SUFFIXES, Payload, channel_for, in_counted_order, last_bits, open_payload  # noqa: E402
@@ -50,37 +47,14 @@ from methods.keyss.small import make_secret  # noqa: E402
 from vectors.surviving import NAMES, write_surviving  # noqa: E402
 
 
-def cell() -> dict[str, object]:
-    """A cell as in docs/byte-layout.md, by the cipher modes of `cryptography`."""
-    secret, carrier_id = bytes(range(32)), bytes(range(16))
-    label, data, tag_bytes = "shard", b"\x02\x01\x00shard", 4
-
-    def key(use: str) -> bytes:
-        return HKDFExpand(SHA256(), 32, f"keyss/v1/{label}/{use}".encode()).derive(secret)
-
-    def aes(use: str, block: bytes) -> bytes:
-        return Cipher(AES(key(use)), ECB()).encryptor().update(block)
-
-    message = carrier_id + data.ljust(16, b"\0")
-    tag = Cipher(AES(key("tag")), CBC(bytes(16))).encryptor().update(message)[-16:][:tag_bytes]
-    nonce = bytes(a ^ b for a, b in zip(carrier_id, tag.ljust(16, b"\0"), strict=True))
-    stream = aes("stream", aes("seed", nonce))
-    return {
-        "secret": secret.hex(),
-        "label": label,
-        "id": carrier_id.hex(),
-        "data": data.hex(),
-        "cell": (tag + bytes(a ^ b for a, b in zip(data, stream, strict=False))).hex(),
-    }
-
-
 def derivation() -> dict[str, object]:
     """Key derivation by argon2-cffi and `cryptography`."""
     vectors = json.loads((FOLDER / "derivation.json").read_text())
     for vector in vectors["valid"]:
+        vector.pop("lsb/key", None)
         key, salt = unicodedata.normalize("NFKC", vector["key"]).encode(), bytes.fromhex(vector["salt"])
         master = hash_secret_raw(key, salt, 3, 64 * 1024, 4, 32, Type.ID)
-        for label in ("writer", "lsb/key"):
+        for label in ("writer", "channel/key"):
             expand = HKDFExpand(SHA256(), 32, f"keyss/v1/{label}".encode())
             vector[label] = expand.derive(master).hex()
     return vectors
@@ -122,9 +96,6 @@ def bare_model() -> Gaussians:
 
 def main() -> None:
     (FOLDER / "derivation.json").write_text(json.dumps(derivation(), indent=1) + "\n")
-    encryption = json.loads((FOLDER / "encryption.json").read_text())
-    encryption["cell"] = cell()
-    (FOLDER / "encryption.json").write_text(json.dumps(encryption, indent=1) + "\n")
     key = json.loads((FOLDER / "carried.json").read_text())["key"]
     secret = trained_like(8, 1, 1)
     secret.means[0, 0] = 1e6  # an outlier
@@ -163,8 +134,8 @@ def write_published() -> None:
 
 
 def write_coded(suffix: str) -> None:
-    """A model whose codes hold two secrets: two models, or a model and a file."""
-    cover = coded.model_of(2300, 11, 0)
+    """A model whose quantised values hold two secrets: two models, or a model and a file."""
+    cover = quantised.model_of(2300, 11, 0)
     other = {
         ".spz": Payload("carry", encode(trained_like(25, 12, 2))),
         ".sog": Payload("carry", encode(trained_like(60, 13, 0))),
@@ -178,7 +149,7 @@ def write_coded(suffix: str) -> None:
 
 def write_decoded(suffix: str) -> None:
     """A .ply decoded from codes, with a secret."""
-    codes = coded.FORMATS[suffix].of(coded.model_of(1500, 21, 0))
+    codes = quantised.FORMATS[suffix].of(quantised.model_of(1500, 21, 0))
     model = codes.dequantise()
     payload = HiddenFile("a note.txt", b"Written at night, read at noon.\n").payload()
     stego = (
@@ -208,7 +179,7 @@ def write_extremes() -> None:
 
 
 def write_counted() -> None:
-    """The carrier bits in the codes of this folder's files."""
+    """The bits of slots in the quantised values of this folder's files."""
     bits = {}
     for path in sorted([*FOLDER.glob("published*"), *FOLDER.glob("coded*"), *FOLDER.glob("extreme*")]):
         if path.suffix != ".json" and isinstance(model := read_model(path), CodedGaussians):
@@ -289,7 +260,7 @@ def write_revealed(key: str) -> None:
     opened += [open_file("pruned.ply", each) for each in TWO_KEYS]
     write_model(FOLDER / "bare.ply", bare_model())
     opened.append(open_file("bare.ply", TWO_KEYS[0]))
-    for suffix in coded.FORMATS:
+    for suffix in quantised.FORMATS:
         write_coded(suffix)
         opened += [open_file(f"coded{suffix}", each) for each in TWO_KEYS]
         write_decoded(suffix)

@@ -1,5 +1,5 @@
 /** From a payload to what `keyss reveal` gives: a model or a file. */
-import type { Payload } from './channels/base.ts';
+import type { Payload } from './channels/container.ts';
 import { decodeModel } from './codec/model_bytes.ts';
 import type { Gaussians } from './core/gaussians.ts';
 

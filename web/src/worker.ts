@@ -1,6 +1,6 @@
 /** The page's worker: reads models and tries keys. Nothing is stored. */
 import DERIVE from 'source:./derive.ts';
-import type { Reader } from './channels/base.ts';
+import type { Reader } from './channels/container.ts';
 import { preparedFor } from './channels/opening.ts';
 import { InputError } from './core/errors.ts';
 import { buffersOf, type Gaussians } from './core/gaussians.ts';

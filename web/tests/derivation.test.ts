@@ -7,14 +7,14 @@ interface Vector {
   salt: string;
   writer?: string;
   verifier?: string;
-  'lsb/key'?: string;
+  'channel/key'?: string;
 }
 
 const { valid } = jsonVector<{ valid: Vector[] }>('derivation.json');
 
 test.each(valid)('key derivation matches Python: $key', async (vector) => {
   const secret = await master(vector.key, hex(vector.salt));
-  for (const label of ['writer', 'verifier', 'lsb/key'] as const) {
+  for (const label of ['writer', 'verifier', 'channel/key'] as const) {
     expect(Buffer.from(expand(secret, label)).toString('hex')).toBe(vector[label]);
   }
 });

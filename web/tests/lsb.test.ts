@@ -1,5 +1,4 @@
 import { expect, test } from 'vitest';
-import { CellCipher } from '../src/channels/lsb/cells.ts';
 import { LsbReader } from '../src/channels/lsb/reading.ts';
 import { selected } from '../src/core/gaussians.ts';
 import { openPly, readPly, writePly } from '../src/files/ply.ts';
@@ -35,16 +34,6 @@ test('added Gaussians are counted', async () => {
   more.means.subarray(3 * model.count).forEach((_, at, own) => (own[at] += 1));
   expect((await LsbReader.of(more)!.open(CARRIED.key))?.foreign).toBeGreaterThan(model.count / 2);
   expect((await LsbReader.of(model)!.open(CARRIED.key))?.foreign).toBeUndefined();
-});
-
-test('encrypted cells match Python', () => {
-  const { cell } = jsonVector<{ cell: Record<string, string> }>('encryption.json');
-  const data = hex(cell.data);
-  const cipher = new CellCipher(hex(cell.secret), cell.label, data.length);
-  const low = hex(cell.cell);
-  expect(cipher.decrypt(hex(cell.id), low, low.length)).toEqual([{ row: 0, data }]);
-  low[0] ^= 1;
-  expect(cipher.decrypt(hex(cell.id), low, low.length)).toEqual([]);
 });
 
 test('encrypted payloads match Python', async () => {

@@ -1,5 +1,5 @@
 import { expect, test } from 'vitest';
-import type { Payload } from '../src/channels/base.ts';
+import type { Payload } from '../src/channels/container.ts';
 import { preparedFor } from '../src/channels/opening.ts';
 import type { ReadModel } from '../src/files/models.ts';
 import { secretOf } from '../src/hidden.ts';

@@ -1,7 +1,7 @@
 import { expect, test } from 'vitest';
 import { AppendedReader } from '../src/channels/appended/appended_reader.ts';
 import { fittedSimilarity } from '../src/channels/appended/pilots.ts';
-import { type Payload, type Reader, unpackPayload } from '../src/channels/base.ts';
+import { type Payload, type Reader, unpackPayload } from '../src/channels/container.ts';
 import { Fountain, NOISY } from '../src/channels/colours/fountain.ts';
 import { ColoursReader } from '../src/channels/colours/colours_reader.ts';
 import { Channels, preparedFor } from '../src/channels/opening.ts';

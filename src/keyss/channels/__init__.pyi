@@ -1,23 +1,22 @@
 from .appended.appended_channel import APPENDED as APPENDED, AppendedReader as AppendedReader
 from .appended.words import is_appended as is_appended
-from .base import (
-    METHOD_BYTES as METHOD_BYTES,
-    Capacity as Capacity,
-    Channel as Channel,
-    Payload as Payload,
-    PreparedCover as PreparedCover,
-    copies as copies,
-    pack_method as pack_method,
-    pack_payload as pack_payload,
-    unpack_method as unpack_method,
-    unpack_payload as unpack_payload,
-)
+from .base import Capacity as Capacity, Channel as Channel, PreparedCover as PreparedCover
 from .colours.colours_channel import (
     COLOURS as COLOURS,
     ColoursCover as ColoursCover,
     ColoursReader as ColoursReader,
 )
 from .colours.fountain import Fountain as Fountain
+from .container import (
+    Parameters as Parameters,
+    Payload as Payload,
+    pack_payload as pack_payload,
+    seal as seal,
+    sealed_size as sealed_size,
+    unpack_payload as unpack_payload,
+    unseal as unseal,
+)
+from .foreign import copies as copies
 from .lsb.bits import (
     DEEPEST as DEEPEST,
     DEPTHS as DEPTHS,
@@ -28,22 +27,19 @@ from .lsb.bits import (
     used_words as used_words,
     write_low_bits as write_low_bits,
 )
-from .lsb.blocks import BlockReader as BlockReader
-from .lsb.cells import CellCipher as CellCipher
 from .lsb.fields import Field as Field, in_counted_order as in_counted_order, last_bits as last_bits
-from .lsb.lsb_channel import (
-    LOW_BITS as LOW_BITS,
-    CodesCover as CodesCover,
-    InCodes as InCodes,
-    LowBitsCover as LowBitsCover,
-)
-from .lsb.lsb_header import (
+from .lsb.low_bits import LOW_BITS as LOW_BITS, LowBitsCover as LowBitsCover, LowBitsReader as LowBitsReader
+from .lsb.low_bits_capacity import (
     TYPICAL_SHARE as TYPICAL_SHARE,
     LowBitsCapacity as LowBitsCapacity,
     check_payload_fits as check_payload_fits,
 )
-from .lsb.payloads import LsbReader as LsbReader
-from .lsb.spread import Message as Message, Shards as Shards
+from .lsb.quantised import (
+    QuantisedChannel as QuantisedChannel,
+    QuantisedCover as QuantisedCover,
+    QuantisedReader as QuantisedReader,
+)
+from .lsb.shards import Message as Message, Shards as Shards
 from .lsb.usable import (
     Carriers as Carriers,
     chance_of_bits as chance_of_bits,

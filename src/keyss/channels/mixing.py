@@ -1,15 +1,6 @@
-"""Hashes, which hide nothing; pseudo-random numbers and Bloom filters, which are derived from a secret.
-
-By a *Bloom filter* (Bloom 1970) of a model's Gaussians, a reader detects foreign ones: added or changed
-later. It has B bits and one keyed hash. Each Gaussian hashes to one of `among` places, and those
-below B are bits: a sample of the Gaussians, in which each is present with probability B / `among`. The bits
-of its own Gaussians are set, so losses do not matter. Of foreign ones in the sample, a share e^-1 hits unset
-bits if the filter holds B Gaussians. Equal IDs count once.
-"""
+"""Hashes, which hide nothing; pseudo-random numbers, which are derived from a secret."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from cryptography.hazmat.primitives.ciphers import Cipher
@@ -17,9 +8,8 @@ from cryptography.hazmat.primitives.ciphers.algorithms import AES
 from cryptography.hazmat.primitives.ciphers.modes import ECB
 
 from keyss.core.arrays import Bytes, Doubles, Integers, Numbers, Words
-from keyss.keys.derivation import expand, stream
+from keyss.keys.derivation import stream
 
-BLOOM_BYTES = 32  # in low bits
 _ODD = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: multiples have well-distributed high bits
 
 
@@ -33,11 +23,11 @@ def mix(words: Words) -> Words:
 
 def row_hashes(rows: Numbers) -> Words:
     """Hashes [N] of rows of integers [N, C]."""
-    found = np.zeros(len(rows), np.uint64)
+    hashes = np.zeros(len(rows), np.uint64)
     for column in rows.T:
-        found = (found ^ column.astype(np.uint64)) * _ODD
-        found ^= found >> np.uint64(29)
-    return found
+        hashes = (hashes ^ column.astype(np.uint64)) * _ODD
+        hashes ^= hashes >> np.uint64(29)
+    return hashes
 
 
 def encrypted_blocks(key: bytes, blocks: Bytes) -> Bytes:
@@ -62,37 +52,3 @@ def random_fractions(secret: bytes, label: str, count: int) -> Doubles:
     """Uniform numbers [count] in (0, 1) derived from a secret."""
     words = random_words(secret, label, count) >> np.uint64(12)
     return (words.astype(np.float64) + 0.5) / 2.0**52
-
-
-def bloom_filter(secret: bytes, ids: Bytes, size: int = BLOOM_BYTES, among: Integers | None = None) -> bytes:
-    """A Bloom filter of `size` bytes of Gaussians with `ids` [N, 16].
-
-    `among` [N]: places that each hashes to, a function of its ID; by default N.
-    """
-    bits = np.zeros(8 * size, np.uint8)
-    bits[_places(secret, ids, len(ids) if among is None else among, len(bits))] = 1
-    return np.packbits(bits, bitorder="little").tobytes()
-
-
-def foreign_share(secret: bytes, ids: Bytes, own: bytes, among: Integers | int, gone: float = 0.0) -> float:
-    """Estimated share, 0 to 1, of foreign Gaussians among those with `ids` [M, 16], by the filter `own`.
-
-    `among` [M]: as in `bloom_filter`, if Gaussians count in inverse proportion to it; else the number of its
-    Gaussians. 1 if less than a share `gone` of the Bloom filter's sample, rounded down, is there.
-    """
-    unset = np.unpackbits(np.frombuffer(own, np.uint8), bitorder="little") == 0
-    places = _places(secret, ids, among, len(unset))
-    if isinstance(among, int):
-        unset = unset[:among]
-    if len(places) < math.floor(gone * (~unset).sum()):
-        return 1.0
-    return min(1.0, float(unset[places].sum() / max(1e-9, len(places) * unset.mean())))
-
-
-def _places(secret: bytes, ids: Bytes, among: Integers | int, kept: int) -> Integers:
-    """Places below `kept` [P] of different IDs."""
-    hashed = encrypted_blocks(expand(secret, "bloom", 32), ids)[:, :8].copy().view("<u4").astype(np.int64)
-    places = hashed[:, 0] % np.maximum(1, among)
-    sampled = np.flatnonzero(places < kept)
-    _, first = np.unique(hashed[sampled, 0] << 32 | hashed[sampled, 1], return_index=True)
-    return places[sampled[first]]

@@ -5,13 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
-from keyss.channels.base import Channel, Payload, Reader, copies, warned
+from keyss.channels.base import Channel
+from keyss.channels.container import Payload, SaltedReader, warned
+from keyss.channels.foreign import copies
 from keyss.channels.names import ConvertedChannel, Format, Publish
 from keyss.core.errors import UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import CodedGaussians
+
+if TYPE_CHECKING:
+    from keyss.channels.colours.colours_channel import ColoursReader
 
 SUFFIXES = {"spz": ".spz", "sog": ".sog", "compressed-ply": ".compressed.ply"}  # of quantised formats
 
@@ -24,8 +29,8 @@ def channel_for(
 ) -> Channel:
     """The channel for a model that is published "unchanged", in `format`, or "converted".
 
-    As is, secrets go into the codes of a quantised `format`, or of the format from which `cover` was read or
-    decoded; else into low bits. Imports that channel only. Raises UsageError for unknown names.
+    Unchanged, secrets go into the quantised values of `format`, or of the format from which `cover` was read
+    or decoded; else into low bits. Imports that channel only. Raises UsageError for unknown names.
     """
     choices = {
         "publish": (publish, Publish),
@@ -44,14 +49,15 @@ def channel_for(
 
         return COLOURS
     from keyss.channels.lsb.decoded import Decoded
-    from keyss.channels.lsb.lsb_channel import LOW_BITS, InCodes
+    from keyss.channels.lsb.low_bits import LOW_BITS
+    from keyss.channels.lsb.quantised import QuantisedChannel
 
     if format is None and isinstance(cover, CodedGaussians):
-        return InCodes(cover.codes.name)
+        return QuantisedChannel(cover.codes.name)
     if format in SUFFIXES:
-        return InCodes(format)
+        return QuantisedChannel(format)
     decoded = None if cover is None else Decoded.of(cover)
-    return InCodes(decoded.codes.name, decoded) if decoded else LOW_BITS
+    return QuantisedChannel(decoded.codes.name, decoded) if decoded else LOW_BITS
 
 
 def suffix_of(stego: Gaussians) -> str:
@@ -77,11 +83,18 @@ def open_payload(stego: Gaussians, key: str) -> Payload:
     raise WrongKeyError()
 
 
-def _readers(stego: Gaussians) -> Iterator[Reader | None]:
+def _readers(stego: Gaussians) -> Iterator[SaltedReader | ColoursReader | None]:
     """The readers of a model. Each channel is imported when the previous ones opened nothing."""
-    from keyss.channels.lsb.payloads import LsbReader
+    from keyss.channels.lsb.decoded import Decoded
+    from keyss.channels.lsb.low_bits import LowBitsReader
+    from keyss.channels.lsb.quantised import QuantisedReader
 
-    yield LsbReader.of(stego)
+    if isinstance(stego, CodedGaussians):
+        yield QuantisedReader.of(stego.codes)
+    elif decoded := Decoded.of(stego):
+        yield QuantisedReader.of(decoded.codes, decoded)
+    else:
+        yield LowBitsReader.of(stego)
     from keyss.channels.appended.appended_channel import AppendedReader
 
     yield AppendedReader.of(stego)

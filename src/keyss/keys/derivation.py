@@ -69,8 +69,8 @@ def _argon2id(key: bytes, salt: bytes) -> bytes:
 class DerivedKey:
     """A key after Argon2id with one salt, and the values that follow from it.
 
-    Labels in use: "embedding" (conditions the decoder), "verifier" (compares keys), "lsb/key" (encrypts a
-    data key), "writer" (randomness of hiding), and those of the other channels.
+    Labels in use: "embedding" (conditions the decoder), "verifier" (compares keys), "channel/key" (decrypts
+    what a channel holds), "writer" (randomness of hiding).
     """
 
     master: bytes  # MASTER_BYTES, the output of Argon2id

@@ -187,8 +187,8 @@ def _capacities(model: Gaussians) -> Iterator[str]:
         except UsageError as error:
             yield f"{flags}: nothing ({error})"
             continue
-        size = max(0, room.bytes - room.overhead)
-        yield f"{flags}: {size:,} bytes, a model of about {size // _BYTES_PER_GAUSSIAN:,} Gaussians"
+        gaussians = room.bytes // _BYTES_PER_GAUSSIAN
+        yield f"{flags}: {room.bytes:,} bytes, a model of about {gaussians:,} Gaussians"
     yield "--publish converted: any secret, as the file grows"
 
 

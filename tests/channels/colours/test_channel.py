@@ -14,7 +14,7 @@ import torch
 from hypothesis import given, settings, strategies as st
 
 from channels.colours.made import PACKED, cover, embed, extract
-from keyss.channels import COLOURS, ColoursCover
+from keyss.channels import COLOURS, ColoursCover, container
 from keyss.channels.colours import colours_channel as channel, header
 from keyss.channels.colours.carriers import Carriers, find_salts
 from keyss.channels.colours.header import FILE_KEY_BYTES, Header, Secrets, places
@@ -35,7 +35,7 @@ def prepared() -> ColoursCover:
 
 @pytest.fixture(scope="module")
 def payload(prepared: ColoursCover) -> bytes:
-    return np.random.default_rng(0).bytes(prepared.capacity.bytes - PACKED)
+    return np.random.default_rng(0).bytes(prepared.planner.bytes - PACKED)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def stego(prepared: ColoursCover, payload: bytes) -> Gaussians:
 @settings(max_examples=8, deadline=None)
 @given(share=st.floats(0, 1), seed=st.integers(0, 2**32))
 def test_every_size_up_to_capacity_comes_back(prepared: ColoursCover, share: float, seed: int) -> None:
-    data = np.random.default_rng(seed).bytes(int(share * (prepared.capacity.bytes - PACKED)))
+    data = np.random.default_rng(seed).bytes(int(share * (prepared.planner.bytes - PACKED)))
     stego = embed(prepared, [("a", data)], entropy=seed.to_bytes(32, "little"))
     assert extract(stego, "a") == data
 
@@ -61,7 +61,7 @@ def test_a_header_made_up_by_chance_hides_no_other(
 
 
 def test_what_does_not_fit_is_refused_with_what_would(prepared: ColoursCover, payload: bytes) -> None:
-    with pytest.raises(UsageError, match=f"{prepared.capacity.bytes:,} bytes of one secret"):
+    with pytest.raises(UsageError, match=f"{prepared.planner.bytes:,} bytes of one secret"):
         embed(prepared, [("a", payload + b"x")])
 
 
@@ -127,7 +127,7 @@ HARDER: dict[str, Callable[[Gaussians], Gaussians]] = {
 def test_a_fifth_of_the_capacity_opens_after(prepared: ColoursCover, name: str) -> None:
     if "spz" in name:
         pytest.importorskip("gsply")
-    data = np.random.default_rng(1).bytes((prepared.capacity.bytes - PACKED) // 5)
+    data = np.random.default_rng(1).bytes((prepared.planner.bytes - PACKED) // 5)
     stego = embed(prepared, [("a", data)], entropy=ENTROPY)
     assert extract(HARDER[name](stego), "a") == data
 
@@ -287,14 +287,14 @@ def test_false_acceptance_is_rarer_than_two_to_the_minus_64(monkeypatch: pytest.
     payload there can be, and as often as a reader tries to decrypt.
     """
     stego = embed(cover(6000), [("a", b"x")], entropy=bytes(32))
-    sizes, decrypt = [], channel.decrypt
+    sizes, unseal = [], container.unseal
 
-    def counted(data_key: bytes, encrypted: bytes, associated: bytes) -> bytes:
-        sizes.append(len(encrypted))
-        decrypt(data_key, encrypted, associated) if len(sizes) == 1 else None
+    def counted(data_key: bytes, sealed: bytes) -> bytes:
+        sizes.append(len(sealed))
+        unseal(data_key, sealed) if len(sizes) == 1 else None
         raise InputError("so that all is tried that ever is")
 
-    monkeypatch.setattr(channel, "decrypt", counted)
+    monkeypatch.setattr(container, "unseal", counted)
     for name in "ab":
         with pytest.raises(Exception, match="the key is right" if name == "a" else "opens nothing"):
             extract(stego, name)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from keyss.channels import LsbReader, Message, Payload, Shards
+from keyss.channels import LowBitsReader, Message, Payload, Shards
 from keyss.core import Gaussians
 from keyss.keys import DerivedKey
 
@@ -49,5 +49,5 @@ def _opened(stego: Gaussians, key: DerivedKey) -> tuple[Payload, list[int], npt.
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Message, "read", read_message)
         patch.setattr(Shards, "decrypt", decrypt_shards)
-        payload = LsbReader.of(stego).extract(key)
+        payload = LowBitsReader.of(stego).extract(key)
     return payload, messages, shards[0]

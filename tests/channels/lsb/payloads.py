@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from keyss.channels import LOW_BITS, LowBitsCover, LsbReader, Payload
-from keyss.channels.base import randomness
+from keyss.channels import LOW_BITS, LowBitsCover, LowBitsReader, Payload
+from keyss.channels.container import randomness
 from keyss.core import Gaussians
 from keyss.keys import DerivedKey
 
@@ -30,17 +30,17 @@ def embed_payloads(
     entropy: bytes | None = None,
 ) -> Gaussians:
     """With a key under each salt, stale ones too."""
-    mixed = randomness(entropy, *(payload.data for _, payload in secrets))
+    mixed = randomness(entropy, [payload for _, payload in secrets])
     fresh = [([keys[i] for i in prepared.fresh_salts], payload) for keys, payload in secrets]
     return prepared.embed_derived(fresh, mixed)
 
 
 def extract(stego: Gaussians, key: str) -> bytes:
-    return _data(LsbReader.of(stego).open(key))
+    return _data(LowBitsReader.of(stego).open(key))
 
 
-def extract_derived(stego: Gaussians | LsbReader, key: DerivedKey) -> bytes:
-    reader = LsbReader.of(stego) if isinstance(stego, Gaussians) else stego
+def extract_derived(stego: Gaussians | LowBitsReader, key: DerivedKey) -> bytes:
+    reader = LowBitsReader.of(stego) if isinstance(stego, Gaussians) else stego
     return _data(reader.extract(key))
 
 

@@ -1,4 +1,4 @@
-"""Models that were decoded from a .spz, .sog or compressed .ply carry in the codes of that file."""
+"""Models that were decoded from a .spz, .sog or compressed .ply carry in its quantised values."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from channels.lsb.coded import FORMATS, model_of
+from channels.lsb.quantised import FORMATS, model_of
 from channels.lsb.trained_like import trained_like
 from keyss.channels import LOW_BITS, Payload, channel_for, open_payload
 from keyss.channels.lsb.decoded import Decoded

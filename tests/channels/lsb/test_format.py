@@ -14,7 +14,7 @@ import pytest
 from argon2.low_level import Type, hash_secret_raw
 from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
-from cryptography.hazmat.primitives.ciphers.algorithms import AES
+from cryptography.hazmat.primitives.ciphers.algorithms import AES, ChaCha20
 from cryptography.hazmat.primitives.ciphers.modes import ECB
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
@@ -100,17 +100,13 @@ def test_a_reader_written_from_the_description_opens_the_carried_model() -> None
     salts = [hashlib.sha256(b"keyss/v3/salt" + b"".join(each)).digest()[:16] for each in least[:4]]
     for salt in salts:
         master = hash_secret_raw(EXPECTED["key"].encode(), salt, 3, 65_536, 4, 32, Type.ID)
-        data_key = _message(_hkdf(master, "lsb/key"), "key", 16, 16, 12, least)
-        packed = _message(data_key, "parameters", 73, 26, 32, least)
-        if packed[:8] == _hkdf(data_key, "lsb/check", 8):
+        data_key = _message(_hkdf(master, "channel/key"), "key", 16, 16, 12, least)
+        packed = _message(data_key, "parameters", 18, 26, 32, least)
+        if packed[:8] == _hkdf(data_key, "check", 8):
             break
-    version, method, size, depth, carriers, codewords, n, k = struct.unpack_from("<B15sIBIIHH", packed, 8)
-    assert (version, method.rstrip(b"\0")) == (7, b"carry")
-    assert carriers == len(ordered)
+    version, depth, codewords, n, k = struct.unpack_from("<BBIHH", packed, 8)
+    assert version == 8
     assert codewords <= 32  # one group
-    bloom, place_key = int.from_bytes(packed[41:], "little"), _hkdf(data_key, "bloom")
-    places = {int.from_bytes(_aes(place_key, own)[:4], "little") % carriers for own, _ in least}
-    assert {place for place in places if place < 256} == {bit for bit in range(256) if bloom >> bit & 1}
 
     shards: dict[int, set[bytes]] = {}
     for _, own, words in ordered:
@@ -121,11 +117,19 @@ def test_a_reader_written_from_the_description_opens_the_carried_model() -> None
             shards.setdefault(number, set()).add(data)
     assert shards.keys() == set(range(codewords * n))
     assert all(len(shards[number]) == 1 for number in range(codewords * k))  # no false ones among the data
-    encrypted = b"".join(min(shards[number]) for number in range(codewords * k))[:size]
+    sealed = b"".join(min(shards[number]) for number in range(codewords * k))
+    mask = Cipher(ChaCha20(_hkdf(data_key, "record"), bytes(16)), None).encryptor().update(bytes(36))
+    record = _xor(sealed[:36], mask)
+    carriers, bloom = struct.unpack_from("<I", record)[0], int.from_bytes(record[4:], "little")
+    assert carriers == len(ordered)
+    place_key = _hkdf(data_key, "bloom")
+    places = {int.from_bytes(_aes(place_key, own)[:4], "little") % carriers for own, _ in least}
+    assert {place for place in places if place < 256} == {bit for bit in range(256) if bloom >> bit & 1}
     payload_key = _hkdf(_hkdf(data_key, "payload-key"), "payload")
-    plain = ChaCha20Poly1305(payload_key).decrypt(bytes(12), encrypted, b"keyss/v1/lsb")
+    plain = ChaCha20Poly1305(payload_key).decrypt(bytes(12), sealed[36:], b"keyss/v1/payload" + record)
     (length,) = struct.unpack_from("<I", plain)
-    payload = plain[4 : 4 + length]
+    method, _, payload = plain[4 : 4 + length].partition(b"\0")
+    assert method == b"carry"
     assert not any(plain[4 + length :])
     assert payload.hex() == EXPECTED["payload"]
     assert struct.unpack_from("<I", payload) == (EXPECTED["count"],)

@@ -11,9 +11,9 @@ import pytest
 import torch
 from scipy import stats
 
-from channels.lsb.coded import FORMATS, bits_of, codes_of, written
+from channels.lsb.quantised import FORMATS, bits_of, codes_of, written
 from channels.lsb.trained_like import trained_like
-from keyss.channels import CodesCover, Field, in_counted_order
+from keyss.channels import Field, QuantisedCover, in_counted_order
 from keyss.channels.lsb.fields import ROTATIONS
 from keyss.core import Gaussians
 from keyss.files.formats.common import in_morton_order
@@ -22,9 +22,9 @@ COUNT = 30_000
 
 
 @pytest.fixture(scope="module", params=FORMATS)
-def file(request: pytest.FixtureRequest) -> tuple[str, CodesCover, Any]:
-    """Its suffix, the cover, and the codes with something in them."""
-    cover = CodesCover.of(codes_of(request.param, COUNT))
+def file(request: pytest.FixtureRequest) -> tuple[str, QuantisedCover, Any]:
+    """Its suffix, the cover, and its values with something in them."""
+    cover = QuantisedCover.of(codes_of(request.param, COUNT))
     return request.param, cover, written(cover, b"x" * 5000)
 
 
@@ -37,7 +37,7 @@ def pairs_of_values(levels: npt.NDArray[np.int32]) -> float:
     return float(stats.chi2.sf(((counts[:, 0] - expected) ** 2 / expected).sum(), len(counts) - 1))
 
 
-def test_written_bits_are_uniform(file: tuple[str, CodesCover, Any]) -> None:
+def test_written_bits_are_uniform(file: tuple[str, QuantisedCover, Any]) -> None:
     _, cover, codes = file
     values = np.packbits(bits_of(codes)[cover.dry == 1])
     assert stats.chisquare(np.bincount(values, minlength=256)).pvalue > 1e-4
@@ -55,7 +55,7 @@ def test_pairs_of_values_find_overwriting_and_not_matching() -> None:
     assert max(pairs_of_values(levels), pairs_of_values(found)) < 1e-9 < 1e-3 < pairs_of_values(overwritten)
 
 
-def test_columns_look_like_those_of_the_untouched_file(file: tuple[str, CodesCover, Any]) -> None:
+def test_columns_look_like_those_of_the_untouched_file(file: tuple[str, QuantisedCover, Any]) -> None:
     """Frequencies of levels, in bins of a few, by a test of two random samples."""
     suffix, cover, codes = file
     after = in_counted_order(codes)[2]
@@ -69,7 +69,7 @@ def test_columns_look_like_those_of_the_untouched_file(file: tuple[str, CodesCov
         assert moved < natural, (new.name, new.column, moved, natural, size)
 
 
-def test_ends_of_ranges_stay(file: tuple[str, CodesCover, Any]) -> None:
+def test_ends_of_ranges_stay(file: tuple[str, QuantisedCover, Any]) -> None:
     _, cover, codes = file
     after = in_counted_order(codes)[2]
     for old, new in zip(cover.fields, after, strict=True):
@@ -103,7 +103,7 @@ def coincidences(codes: Any) -> dict[str, int]:
 
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_there_are_as_many_coincidences_as_before(suffix: str) -> None:
-    cover = CodesCover.of(FORMATS[suffix].quantise(hardly_trained()))
+    cover = QuantisedCover.of(FORMATS[suffix].quantise(hardly_trained()))
     before, after = coincidences(cover.codes), coincidences(written(cover, b"x" * 5000))
     for name, count in before.items():
         assert count > 80

@@ -1,4 +1,4 @@
-"""The holder of one key, who tries all cells, sees the same whether there are other secrets or not."""
+"""The holder of one key, who tries all shards, sees the same whether there are other secrets or not."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DRAWS = 3
 def _seen(own: float, others: Sequence[float], draw: int) -> dict[str, float]:
     """What the holder of the first key sees; sizes in quarters of the carriers at the least depth."""
     prepared = LOW_BITS.prepare(trained_like(COVER, seed=draw))
-    quarter = prepared.capacity.steps[0][1] - prepared.capacity.overhead
+    quarter = prepared.capacity.shares[0][1]
     payloads = [Payload("test", os.urandom(int(count * quarter))) for count in (own, *others)]
     keyed = [(keys(10 * draw + index), payload) for index, payload in enumerate(payloads)]
     stego = embed_payloads(prepared, keyed, os.urandom(32))

@@ -11,9 +11,10 @@ import pytest
 from scipy.stats import ks_2samp
 
 from channels.lsb.trained_like import keys
-from keyss.channels import LEAST, Layout, LowBitsCapacity, Payload
-from keyss.channels.lsb.lsb_header import Parameters, key_message, key_secret, parameter_message
-from keyss.channels.lsb.payloads import Writer
+from keyss.channels import LEAST, Layout, LowBitsCapacity, Parameters, Payload, Shards
+from keyss.channels.container import key_secret
+from keyss.channels.lsb.low_bits import Writer
+from keyss.channels.lsb.low_bits_capacity import codewords_of, key_message, parameter_message
 from keyss.channels.lsb.usable import SALTS
 from keyss.core import KeyssWarning
 
@@ -21,15 +22,15 @@ CARRIERS, LAYOUT = 4000, Layout(3)
 IDS = np.random.default_rng(0).integers(0, 256, (CARRIERS, 16), np.uint8)
 OWN = keys(0)
 HIDINGS = 40
-CAPACITY = LowBitsCapacity(CARRIERS, {LEAST: CARRIERS}, LAYOUT)
-QUARTER = CAPACITY.for_payloads().steps[0][1] - 100  # bytes that fit into a quarter of these carriers
-THIRD = CAPACITY.payload_capacity(3) - 100  # bytes that fit into equal shares of three
+CAPACITY = LowBitsCapacity(CARRIERS, CARRIERS, LAYOUT, (LEAST,))
+QUARTER = CAPACITY.for_payloads().shares[0][1]  # bytes that fit into a quarter of these carriers
+THIRD = CAPACITY.for_payloads().equal(3)  # bytes that fit into equal shares of three
 
 
 def _seen(sizes: Sequence[int]) -> list[float]:
     """What the holder of the first key can count of its own rows, and of all others together."""
     payloads = [Payload("test", os.urandom(size)) for size in sizes]
-    writer = Writer(CAPACITY, {LEAST: np.ones(CARRIERS, bool)}, IDS, os.urandom(32))
+    writer = Writer(CAPACITY, np.ones(CARRIERS, bool), IDS, os.urandom(32))
     low = np.empty((CARRIERS, LAYOUT.width(LEAST)), np.uint8)
     for _, rows, data in writer.write([([k] * SALTS, each) for k, each in zip(OWN, payloads, strict=False)]):
         low[rows, : data.shape[1]] = data
@@ -40,9 +41,9 @@ def _seen(sizes: Sequence[int]) -> list[float]:
     message = parameter_message(data_key, low.shape[1])
     packed = message.read(IDS, low)
     places, contents = message.write(IDS, packed)
-    own_parameters = (low[places] == contents).all(axis=1)
-    found = Parameters.unpack(packed, data_key, LAYOUT)
-    own = found.shards(data_key, LAYOUT).decrypt(IDS, low)[0]
+    own_parameters = (low[places, : contents.shape[1]] == contents).all(axis=1)
+    found = Parameters.unpack(packed, data_key)
+    own = Shards(data_key, codewords_of(found, LAYOUT), True).decrypt(IDS, low)[0]
     return [
         float(own_key.sum()),
         float(own_parameters.sum()),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from channels.lsb.coded import FORMATS, model_of
+from channels.lsb.quantised import FORMATS, model_of
 from files.formats.examples import same_codes
 from keyss.channels import SUFFIXES, Payload, channel_for
 from keyss.core import Gaussians, WrongKeyError

@@ -21,8 +21,7 @@ from keyss.channels import (
     LOW_BITS,
     Layout,
     LowBitsCapacity,
-    LsbReader,
-    base,
+    LowBitsReader,
     check_payload_fits,
     gaussian_ids,
     read_low_bits,
@@ -30,8 +29,10 @@ from keyss.channels import (
     usable_carriers,
     write_low_bits,
 )
-from keyss.channels.lsb import spread
-from keyss.channels.mixing import bloom_filter, foreign_share
+from keyss.channels.container import SALTS_TRIED
+from keyss.channels.foreign import exact_foreign, exact_record
+from keyss.channels.lsb import shards
+from keyss.channels.lsb.low_bits_capacity import OVERHEAD
 from keyss.core import Gaussians, InputError, KeyssWarning, UsageError, WrongKeyError
 from keyss.files import read_model, write_model
 from keyss.keys import ALPHABET, DerivedKey, generate_key
@@ -70,8 +71,8 @@ def test_round_trip_of_lower_degrees(degree: int, unit: bool) -> None:
     stego = embed_derived(model, [(own, PAYLOAD[:1500])])
     assert extract_derived(stego, own[0]) == PAYLOAD[:1500]
     order = torch.randperm(6000, generator=torch.Generator().manual_seed(degree))[:4500]
-    pruned = LsbReader.of(stego[order])
-    first = LsbReader.of(stego).salts.index(pruned.salts[0])
+    pruned = LowBitsReader.of(stego[order])
+    first = LowBitsReader.of(stego).salts.index(pruned.salts[0])
     assert extract_derived(pruned, own[first]) == PAYLOAD[:1500]
 
 
@@ -113,7 +114,7 @@ def test_survives_shuffling_and_the_loss_of_a_quarter(stego: Gaussians, seed: in
     own = keys()
     again = embed_derived(stego, [(own, PAYLOAD)])
     kept = again[order[: len(stego) * 3 // 4]]
-    salt = LsbReader.of(again).salts.index(LsbReader.of(kept).salts[0])
+    salt = LowBitsReader.of(again).salts.index(LowBitsReader.of(kept).salts[0])
     assert extract_derived(kept, own[salt]) == PAYLOAD
     if seed == 0:
         assert extract(stego[order[: len(stego) * 3 // 4]], KEY) == PAYLOAD
@@ -181,7 +182,7 @@ def test_a_thousand_random_keys_open_nothing() -> None:
     """Below Argon2id, whose output is replaced: it is what keys differ in."""
     model, own = trained_like(SMALLEST, seed=3), keys()
     stego = embed_derived(model, [(own, b"x")])
-    reader = LsbReader.of(stego)
+    reader = LowBitsReader.of(stego)
     assert extract_derived(reader, own[0]) == b"x"
     for number in range(1000):
         with pytest.raises(WrongKeyError):
@@ -219,15 +220,15 @@ def test_a_wrong_key_makes_the_same_work_as_a_right_one(
 ) -> None:
     """Up to the decryption of the payload: nearly as many blocks of AES; those of its shards are few."""
     blocks = 0
-    real = spread.encrypted_blocks
+    real = shards.encrypted_blocks
 
     def counted(key: bytes, data: np.ndarray) -> np.ndarray:
         nonlocal blocks
         blocks += data.size // 16
         return real(key, data)
 
-    monkeypatch.setattr(spread, "encrypted_blocks", counted)
-    reader = LsbReader.of(stego)
+    monkeypatch.setattr(shards, "encrypted_blocks", counted)
+    reader = LowBitsReader.of(stego)
     assert extract_derived(reader, DerivedKey.of(KEY, reader.salts[0])) == PAYLOAD
     needed, blocks = blocks, 0
     with pytest.raises(WrongKeyError):
@@ -240,7 +241,7 @@ def test_a_wrong_key_is_tried_under_a_few_salts(stego: Gaussians, monkeypatch: p
     monkeypatch.setattr(DerivedKey, "of", lambda key, salt: derived.append(key) or keys(5)[0])
     with pytest.raises(WrongKeyError):
         extract(stego, "The right key")
-    assert len(derived) == base.SALTS_TRIED
+    assert len(derived) == SALTS_TRIED
 
 
 def test_ordinary_models_open_for_nobody_and_look_the_same(plain: Gaussians) -> None:
@@ -274,7 +275,7 @@ def test_capacity_grows_with_the_model_and_is_kept_to() -> None:
             assert plan.independent == (capacity.gaussians >= 8000)
             assert plan.depth == 4
             taken = sum(share.carriers for share in plan.shares) + secrets * capacity.header_carriers
-            assert taken <= capacity.carriers[plan.depth]
+            assert taken <= capacity.carriers
         largest = capacity.payload_capacity(1)
         assert size <= largest < 1.5 * size
         assert capacity.plan([largest]).depth == 8
@@ -284,27 +285,27 @@ def test_capacity_grows_with_the_model_and_is_kept_to() -> None:
 
 def test_a_secret_gets_the_least_share_that_holds_it() -> None:
     capacity = LowBitsCapacity.of(20_000, Layout(3))
-    steps = capacity.for_payloads().steps
+    steps = capacity.for_payloads().shares
     assert [part for part, _ in steps] == [0.25, 0.5, 1, 1, 1]
     sizes = [size for _, size in steps]
     assert sizes == sorted(sizes)
-    plans = [capacity.plan([size]) for size in sizes]
+    plans = [capacity.plan([size + OVERHEAD]) for size in sizes]
     assert [plan.depth for plan in plans] == [4, 4, 4, 6, 8]
     carriers = [plan.shares[0].carriers for plan in plans]
     assert carriers[0] < carriers[1] < carriers[2] == carriers[3] == carriers[4]
-    assert not capacity.plan([sizes[2], sizes[0]]).independent
+    assert not capacity.plan([sizes[2] + OVERHEAD, sizes[0] + OVERHEAD]).independent
 
 
 def test_more_than_the_places_of_header_and_shards_never_decides() -> None:
     """At the largest size of each share, with a quarter of the Gaussians lost at random."""
     model, own = trained_like(6000, 21), keys()
     prepared = LOW_BITS.prepare(model)
-    for index, (_, size) in enumerate(prepared.capacity.steps):
-        data = os.urandom(size - prepared.capacity.overhead)
+    for index, (_, size) in enumerate(prepared.capacity.shares):
+        data = os.urandom(size)
         stego = embed_derived(model, [(own, data)])
         order = torch.randperm(6000, generator=torch.Generator().manual_seed(index))[:4500]
-        reader = LsbReader.of(stego[order])
-        known = LsbReader.of(stego).salts.index(reader.salts[0])
+        reader = LowBitsReader.of(stego[order])
+        known = LowBitsReader.of(stego).salts.index(reader.salts[0])
         assert extract_derived(reader, own[known]) == data
 
 
@@ -361,7 +362,7 @@ def cover() -> Gaussians:
 
 
 def test_two_hidings_in_one_cover_have_no_salt_in_common(cover: Gaussians) -> None:
-    first, second = (LsbReader.of(embed(cover, [(KEY, b"x")])).salts for _ in range(2))
+    first, second = (LowBitsReader.of(embed(cover, [(KEY, b"x")])).salts for _ in range(2))
     assert len(set(first)) == len(set(second)) == 12
     assert not set(first) & set(second)
 
@@ -369,7 +370,7 @@ def test_two_hidings_in_one_cover_have_no_salt_in_common(cover: Gaussians) -> No
 def test_copies_count_once(cover: Gaussians) -> None:
     stego = embed(cover, [(KEY, PAYLOAD)])
     five = Gaussians.cat([stego] * 5)[torch.randperm(5 * len(stego))]
-    one, other = (LsbReader.of(model).open(KEY) for model in (stego, five))
+    one, other = (LowBitsReader.of(model).open(KEY) for model in (stego, five))
     assert one == other
     assert one.shards == other.shards
     assert other.foreign == 0
@@ -434,9 +435,9 @@ def test_fewer_foreign_gaussians_than_a_quarter_are_noticed(cover: Gaussians, le
 
 
 def test_bloom_filter_counts_foreign_gaussians() -> None:
-    ids = np.random.default_rng(0).integers(0, 256, (40_000, 16), np.uint8)
+    ids, key = np.random.default_rng(0).integers(0, 256, (40_000, 16), np.uint8), bytes(16)
     for count in (1, 100, 20_000):
-        own = bloom_filter(KEY.encode().ljust(16), ids[:count])
-        assert foreign_share(KEY.encode().ljust(16), ids[:count], own, count) == 0
-    assert 0.35 < foreign_share(KEY.encode().ljust(16), ids, own, 20_000) < 0.65
-    assert foreign_share(b"another data key", ids[:20_000], own, 20_000) > 0.8
+        record = exact_record(key, ids[:count])
+        assert exact_foreign(record, key, ids[:count]) == 0
+    assert 14_000 < exact_foreign(record, key, ids) < 26_000
+    assert exact_foreign(record, b"another data key", ids[:20_000]) > 16_000

@@ -1,4 +1,4 @@
-"""Salts that the author of a cover could know in advance have no key cells."""
+"""Salts that the author of a cover could know in advance hold no keys."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 
 from channels.lsb.payloads import embed, embed_derived, extract_derived
 from channels.lsb.trained_like import keys, trained_like
-from keyss.channels import Layout, LsbReader, gaussian_ids, salt_rows, usable_carriers
+from keyss.channels import Layout, LowBitsReader, gaussian_ids, salt_rows, usable_carriers
 from keyss.core import Gaussians, UsageError, WrongKeyError
 
 
@@ -24,7 +24,7 @@ def planted(pairs: int, seed: int = 3) -> Gaussians:
 
 
 def salts_of(model: Gaussians) -> list[bytes]:
-    return list(LsbReader.of(model).salts)
+    return list(LowBitsReader.of(model).salts)
 
 
 @pytest.mark.parametrize("pairs", [800, 900])
@@ -55,11 +55,11 @@ def test_a_table_made_before_hiding_opens_nothing() -> None:
 def test_a_cover_with_stale_salts_opens_from_what_pruning_leaves() -> None:
     cover = planted(150)
     stego = embed(cover, [("a key", b"secret")], os.urandom(32))
-    reader = LsbReader.of(stego)
+    reader = LowBitsReader.of(stego)
     assert reader.open("a key").data == b"secret"  # type: ignore[union-attr]
     order = torch.randperm(len(stego), generator=torch.Generator().manual_seed(1))
     pruned = stego[order[: len(stego) * 3 // 4]]
-    assert LsbReader.of(pruned).open("a key").data == b"secret"  # type: ignore[union-attr]
+    assert LowBitsReader.of(pruned).open("a key").data == b"secret"  # type: ignore[union-attr]
 
 
 def test_salts_of_ordinary_models_are_fresh() -> None:

@@ -11,7 +11,7 @@ from hypothesis import given, strategies as st
 
 from channels.lsb.payloads import embed_derived
 from channels.lsb.trained_like import keys, trained_like
-from keyss.channels import LOW_BITS, LsbReader, chance_of_bits, read_low_bits, usable_carriers
+from keyss.channels import LOW_BITS, LowBitsReader, chance_of_bits, read_low_bits, usable_carriers
 from keyss.channels.lsb import usable
 from keyss.channels.lsb.bits import DEPTHS, Layout, used_words, write_low_bits
 from keyss.channels.lsb.equal_steps import Steps
@@ -152,7 +152,7 @@ def test_quaternions_of_unit_length_stay_so() -> None:
     assert Layout.of(unit) == Layout.of(stego) == Layout(3, quats=False)
     assert torch.equal(stego.quats, unit.quats)
     assert read_low_bits(stego).shape[1] == 49
-    assert LsbReader.of(stego).extract(own[0]).data == b"secret"  # type: ignore[union-attr]
+    assert LowBitsReader.of(stego).extract(own[0]).data == b"secret"  # type: ignore[union-attr]
 
 
 def test_unit_quaternions_and_half_precision_of_a_few_stay_as_they_are() -> None:

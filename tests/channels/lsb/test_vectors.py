@@ -6,10 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from keyss.channels import CellCipher
 from keyss.core import errors
 from keyss.keys import DerivedKey, encryption
 
@@ -28,7 +26,7 @@ def _derived(vector: dict[str, Any]) -> DerivedKey:
 def test_derivation(vector: dict[str, Any]) -> None:
     key = _derived(vector)
     assert key.verifier().hex() == vector["verifier"]
-    for label in ("writer", "lsb/key"):
+    for label in ("writer", "channel/key"):
         assert key.expand(label, 32).hex() == vector[label]
     assert key.embedding()[:4].tolist() == pytest.approx(vector["embedding_first_4"], abs=2e-6)
 
@@ -56,16 +54,3 @@ def test_invalid_encrypted_data(vector: dict[str, Any]) -> None:
             bytes.fromhex(vector["encrypted"]),
             bytes.fromhex(good["associated"]),
         )
-
-
-def test_cell() -> None:
-    vector = ENCRYPTION["cell"]
-    carrier_id, data, cell = (
-        np.frombuffer(bytes.fromhex(vector[name]), np.uint8)[None] for name in ("id", "data", "cell")
-    )
-    secret, label = bytes.fromhex(vector["secret"]), vector["label"]
-    cipher = CellCipher(secret, label, data.shape[1])
-    assert (cipher.encrypt(carrier_id, data) == cell).all()
-    fits, decrypted = cipher.decrypt(carrier_id, cell)
-    assert fits.all()
-    assert (decrypted == data).all()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from channels.lsb.payloads import embed_payloads
-from keyss.channels import LOW_BITS, LsbReader, Payload
+from keyss.channels import LOW_BITS, LowBitsReader, Payload
 from keyss.core import Gaussians
 from keyss.keys import DerivedKey
 from keyss.methods import CarriedSecret
@@ -29,8 +29,8 @@ def embed_derived(
 
 
 def extract(stego: Gaussians, key: str) -> CarriedSecret:
-    return CarriedSecret.of(LsbReader.of(stego).open(key))
+    return CarriedSecret.of(LowBitsReader.of(stego).open(key))
 
 
-def extract_derived(reader: LsbReader, key: DerivedKey) -> CarriedSecret:
+def extract_derived(reader: LowBitsReader, key: DerivedKey) -> CarriedSecret:
     return CarriedSecret.of(reader.extract(key))

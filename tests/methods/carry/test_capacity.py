@@ -11,11 +11,11 @@ import torch
 
 from channels.lsb.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Gaussians
-from keyss.channels import LOW_BITS, Layout, LowBitsCapacity
+from keyss.channels import LOW_BITS, Layout, LowBitsCapacity, Payload, sealed_size
+from keyss.channels.foreign import EXACT_BYTES
 from keyss.core import KeyssWarning, UsageError
-from keyss.keys.encryption import OVERHEAD, compressed_size
 from keyss.methods import Context, Prepared, Source, registry
-from keyss.methods.carry.capacity import CarryCapacity, shares
+from keyss.methods.carry.capacity import CarryCapacity
 from keyss.rendering import Viewpoints, scene_of_model
 
 KEY = "a key of many characters: 93hXmQ2"
@@ -69,9 +69,9 @@ def test_shares_fit(gaussians: int, secrets: int) -> None:
     capacity, random = cells.for_payloads(), np.random.default_rng(0)
     for _ in range(20):
         needed = random.integers(1, capacity.bytes + 2, secrets).tolist()
-        limits = shares(capacity, needed)
+        limits = capacity.limits(needed)
         if min(limits):
-            cells.plan([compressed_size(random.bytes(limit)) + OVERHEAD for limit in limits])
+            cells.plan([sealed_size(Payload("carry", random.bytes(limit)), EXACT_BYTES) for limit in limits])
 
 
 def test_pruning_for_other_secrets_warns() -> None:

@@ -14,7 +14,7 @@ from keyss.channels import (
     LOW_BITS,
     Layout,
     LowBitsCover,
-    LsbReader,
+    LowBitsReader,
     gaussian_ids,
     read_low_bits,
     salt_rows,
@@ -46,7 +46,7 @@ def stego(cover: Gaussians, secret: Gaussians) -> Gaussians:
 
 def salt_of(model: Gaussians, own: list[DerivedKey], before: Gaussians) -> DerivedKey:
     """The key under the salt that a reader of `model` tries first."""
-    return own[LsbReader.of(before).salts.index(LsbReader.of(model).salts[0])]
+    return own[LowBitsReader.of(before).salts.index(LowBitsReader.of(model).salts[0])]
 
 
 def test_round_trip(cover: Gaussians, secret: Gaussians) -> None:
@@ -63,7 +63,7 @@ def test_round_trip(cover: Gaussians, secret: Gaussians) -> None:
 def test_sh_degrees(cover_degree: int, secret_degree: int) -> None:
     model, hidden = trained_like(12_000, sh_degree=cover_degree), trained_like(200, 1, secret_degree)
     own = keys()
-    carried = extract_derived(LsbReader.of(embed_derived(model, [(own, hidden)])), own[0])
+    carried = extract_derived(LowBitsReader.of(embed_derived(model, [(own, hidden)])), own[0])
     assert carried.gaussians.sh_degree == secret_degree
     assert len(carried.gaussians) == 200
 
@@ -80,7 +80,7 @@ def test_every_usable_gaussian_is_written() -> None:
         assert (changed == usable_carriers(cover)).all()
         counts = np.bincount(read_low_bits(stego, 4).ravel(), minlength=256)
         assert ((counts - counts.mean()) ** 2).sum() / counts.mean() < 255 + 6 * (2 * 255) ** 0.5
-        carriers = LsbReader.of(stego)
+        carriers = LowBitsReader.of(stego)
         carried = extract_derived(carriers, own[0])
         seen.append((carried.payload.shards, len(carried.gaussians)))
         with pytest.raises(WrongKeyError):
@@ -93,12 +93,12 @@ def test_shuffling_and_pruning(cover: Gaussians, secret: Gaussians, seed: int) -
     """Nothing is lost with a quarter of the Gaussians."""
     own = keys()
     stego = embed_derived(cover, [(own, secret)], entropy=ENTROPY)
-    whole = extract_derived(LsbReader.of(stego), own[0])
+    whole = extract_derived(LowBitsReader.of(stego), own[0])
     order = torch.randperm(len(stego), generator=torch.Generator().manual_seed(seed))
-    shuffled = extract_derived(LsbReader.of(stego[order]), own[0])
+    shuffled = extract_derived(LowBitsReader.of(stego[order]), own[0])
     assert shuffled.gaussians.digest() == whole.gaussians.digest()
     pruned = stego[order[: len(stego) * 3 // 4]]
-    carried = extract_derived(LsbReader.of(pruned), salt_of(pruned, own, stego))
+    carried = extract_derived(LowBitsReader.of(pruned), salt_of(pruned, own, stego))
     assert carried.gaussians.digest() == whole.gaussians.digest()
     left, shards = carried.payload.shards
     assert whole.payload.shards == (shards, shards)
@@ -109,7 +109,7 @@ def test_shuffling_and_pruning(cover: Gaussians, secret: Gaussians, seed: int) -
 def test_bit_flip_loses_one_shard(cover: Gaussians, secret: Gaussians) -> None:
     """Any bit of any attribute, including Gaussians that hold a salt."""
     stego = embed(cover, [(KEY, secret)], entropy=ENTROPY)
-    names = LsbReader.of(stego).salts
+    names = LowBitsReader.of(stego).salts
     own = [DerivedKey.of(KEY, salt) for salt in names[:3]]
     whole = extract(stego, KEY)
     random = np.random.default_rng(0)
@@ -119,7 +119,7 @@ def test_bit_flip_loses_one_shard(cover: Gaussians, secret: Gaussians) -> None:
         changed = _with_flipped_bit(stego, row, int(random.integers(59)), int(random.integers(31)))
         if changed is None:
             continue
-        carriers = LsbReader.of(changed)
+        carriers = LowBitsReader.of(changed)
         name = next(name for name in carriers.salts[:2] if name in names[:3])
         found = extract_derived(carriers, own[names.index(name)])
         assert found.gaussians.digest() == whole.gaussians.digest()
@@ -141,11 +141,11 @@ def _with_flipped_bit(model: Gaussians, row: int, column: int, bit: int) -> Gaus
 @pytest.mark.filterwarnings("ignore::keyss.core.KeyssWarning")  # of added Gaussians
 def test_foreign_gaussians_do_not_block_salts(stego: Gaussians, secret: Gaussians) -> None:
     """Three inserted Gaussians come first in the order of salts."""
-    own = LsbReader.of(stego).salts
+    own = LowBitsReader.of(stego).salts
     added = trained_like(60_000, seed=9)  # three of many have smaller IDs than all others
     added = added[torch.from_numpy(salt_rows(added, gaussian_ids(added), Layout.of(added))[:3])]
     crowded = Gaussians.cat([added, stego])
-    assert not set(own) & set(LsbReader.of(crowded).salts[:3])
+    assert not set(own) & set(LowBitsReader.of(crowded).salts[:3])
     assert extract(crowded, KEY).gaussians.digest() == extract(stego, KEY).gaussians.digest()
     assert len(extract(crowded, KEY).gaussians) == len(secret)
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import keyss
-from channels.lsb.coded import model_of
+from channels.lsb.quantised import model_of
 from files.formats.examples import same_codes
 from keyss import CarryOptions
 from keyss.channels import SUFFIXES, channel_for, in_counted_order

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from keyss.channels import LsbReader
+from keyss.channels import LowBitsReader
 from keyss.core import Gaussians, WrongKeyError
 from keyss.files import read_model
 from methods.carry.carried import extract
@@ -23,7 +23,7 @@ STEGO = read_model(FOLDER / "carried.ply")
 
 
 def test_known_answer() -> None:
-    payload = LsbReader.of(STEGO).open(VECTOR["key"])
+    payload = LowBitsReader.of(STEGO).open(VECTOR["key"])
     assert payload.data.hex() == VECTOR["payload"]
     assert len(extract(STEGO, VECTOR["key"]).gaussians) == VECTOR["count"]
 

@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as arrays
 from scipy.spatial.transform import Rotation
 
 import keyss
-from channels.lsb.coded import model_of
+from channels.lsb.quantised import model_of
 from channels.lsb.trained_like import trained_like
 from keyss import Secret
 from keyss.core import DRAWN_OPACITY, Camera, Gaussians, InputError, Scene, UsageError, View

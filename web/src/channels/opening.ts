@@ -8,7 +8,8 @@ import type { Gaussians } from '../core/gaussians.ts';
 import type { ReadModel } from '../files/models.ts';
 import type { Derive } from '../keys/keys.ts';
 import { AppendedReader } from './appended/appended_reader.ts';
-import { copies, type Payload, type Reader } from './base.ts';
+import type { Payload, Reader } from './container.ts';
+import { copies } from './foreign.ts';
 import { ColoursReader } from './colours/colours_reader.ts';
 import { LsbReader } from './lsb/reading.ts';
 

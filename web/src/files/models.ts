@@ -8,10 +8,10 @@ import { openPly, readPly, withoutNonFinite } from './ply.ts';
 import { type Decode, readSog, type SogCodes } from './sog.ts';
 import { readSpz, type SpzCodes } from './spz.ts';
 
-/** The codes of formats whose low bits can carry secrets. */
+/** The quantised values of formats that can carry secrets. */
 export type Codes = SpzCodes | SogCodes | CompressedPlyCodes;
 
-/** A file's model. Derived models must not keep the codes. */
+/** A file's model. Derived models must not keep its quantised values. */
 export interface ReadModel extends Gaussians {
   readonly codes?: Codes;
 }

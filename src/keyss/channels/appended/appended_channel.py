@@ -1,23 +1,23 @@
 """Secrets in appended Gaussians, too faint and too small to see.
 
 They survive every publication format, and moving, rotating and scaling of the whole model. Everybody can see
-that they are there; only the key reads them. A payload is encrypted as a whole (ChaCha20-Poly1305, with a key
-from Argon2id and the file's salt) and cut into packets, one per Gaussian. Reed-Solomon adds parity: any 5895
-packets of a codeword of at most 8192 suffice. A header holds the number of data packets. Random words pad the
-total to one of few numbers, which reveal little of the size and the number of secrets.
+that they are there; only the key reads them. A slot is a *word* without identity or order, so a shard makes a
+*packet* that holds its number. Any 5895 packets of a codeword of at most 8192 suffice. A header holds the
+number of data packets. Random words pad the total to one of few numbers, which reveal little of the size and
+the number of secrets.
 """
 
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from keyss.channels.appended import cover as cover_filters, pilots
+from keyss.channels import container
+from keyss.channels.appended import pilots
 from keyss.channels.appended.words import (
     HEADERS,
     WORD_BITS,
@@ -39,25 +39,16 @@ from keyss.channels.appended.words import (
     write_header,
     write_packets,
 )
-from keyss.channels.base import (
-    METHOD_BYTES,
-    Capacity,
-    Channel,
-    Payload,
-    SaltedReader,
-    check_keys,
-    pack_payload,
-    randomness,
-    unpack_payload,
-)
+from keyss.channels.base import Capacity, Channel
+from keyss.channels.container import Payload, SaltedReader
+from keyss.channels.foreign import COARSE_BYTES, coarse_foreign, coarse_record
 from keyss.channels.mixing import random_order
 from keyss.channels.reed_solomon import Codewords
 from keyss.core.arrays import Bits, Doubles, Integers
-from keyss.core.errors import KeyssWarning, UsageError, WrongKeyError
+from keyss.core.errors import UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand, stream
-from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
 
 # Expected share of intact packets after the loss of a quarter, and the margin in standard deviations. Longer
 # codewords need fewer packets and more time; 5895 data packets make a codeword of 8192.
@@ -66,16 +57,12 @@ _LEFT, _DEVIATIONS, _MAX_DATA = 0.74, 4.2, 5895
 _WIDE, _NARROW, _WIDE_PACKETS = 8, 6, 90_000
 _MAX_PACKETS = 1_000_000  # data packets; a header holds up to 2^20
 _STEP = 256  # smallest difference between numbers of appended Gaussians
-_OVERHEAD = OVERHEAD + METHOD_BYTES + 1 + cover_filters.BYTES
+_OVERHEAD = container.MAX_OVERHEAD + COARSE_BYTES
 
 # Search for the lattice's offset: Gaussians in which pilots are counted, maximum number of offsets, and
 # standard deviations by which pilots must outnumber accidental ones.
 _SAMPLE, _MAX_OFFSETS, _SIGNIFICANT = 8000, 8, 3.0
-_ASSOCIATED = b"keyss/v1/appended/data"
-# Least share of foreign Gaussians that causes a warning. Conversions make none foreign; of another model,
-# 0.95 and more are.
-_FOREIGN = 0.05
-MAX_BYTES = _MAX_PACKETS * _NARROW - OVERHEAD - METHOD_BYTES - cover_filters.BYTES
+MAX_BYTES = _MAX_PACKETS * _NARROW  # of sealed payloads
 _VISIBLE_SECRETS = (
     "the number of appended Gaussians reveals the total size: the holder of one key can tell that there are "
     "other secrets"
@@ -95,13 +82,12 @@ class Appended(Channel):
         return AppendedCover(cover)
 
     def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
-        return Capacity(MAX_BYTES, _OVERHEAD, grows=True)
+        shares = [(1.0, MAX_BYTES)]
+        return Capacity.of_sealed(_OVERHEAD, shares, lambda count: MAX_BYTES // count, grows=True)
 
     def appended_count(self, sizes: Sequence[int]) -> int:
-        """The number of Gaussians appended for payloads of these compressed sizes in bytes."""
-        single = len(sizes) == 1
-        every = [_codewords_for(size + cover_filters.BYTES, single) for size in sizes]
-        return _padded_count(sum(HEADERS + each.shards for each in every))
+        """The number of Gaussians appended for payloads of these bytes of compressed data, at most."""
+        return _padded_count([_codewords_for(size + _OVERHEAD, len(sizes)) for size in sizes])
 
 
 APPENDED = Appended()
@@ -121,23 +107,25 @@ class AppendedCover:
         """The cover followed by the appended Gaussians. Warns if there is more than one secret."""
         model = self.cover.detach().to("cpu")
         to_world = own_frame(model)
-        packed = [pack_payload(payload) for _, payload in payloads]
-        secret = randomness(entropy, *packed)
+        secret = container.randomness(entropy, [payload for _, payload in payloads])
         salt = expand(secret, "appended/salt", SALT_BYTES)
         random = np.random.default_rng(np.frombuffer(stream(secret, "appended/random", 32), np.uint32))
-        keys = [DerivedKey.of(key, salt) for key, _ in payloads]
-        check_keys([key.verifier() for key in keys])
+        keys = [container.key_secret(DerivedKey.of(key, salt)) for key, _ in payloads]
+        container.check_keys(keys)
         if len(keys) > 1:
-            warnings.warn(_VISIBLE_SECRETS, KeyssWarning, stacklevel=2)
-        total = APPENDED.appended_count([compressed_size(each) for each in packed])
+            container.warn_of_others(_VISIBLE_SECRETS)
+        sizes = [container.sealed_size(payload, COARSE_BYTES) for _, payload in payloads]
+        every = [_codewords_for(size, len(sizes)) for size in sizes]
+        total = _padded_count(every)
         words = [pilots.write(salt, pilots.count_for(total), random)]
-        for key, each in zip(keys, packed, strict=True):
-            own = cover_filters.pack(model, total, to_world.inverse(), _filter_key(key))
-            words.append(_words(key, own, each, len(keys) == 1))
+        for data_key, (_, payload), codewords in zip(keys, payloads, every, strict=True):
+            record = coarse_record(data_key, model, total, to_world.inverse())
+            sealed = container.seal(data_key, payload, codewords.size, record)
+            words.append(_words(data_key, codewords, sealed))
         words.append(_random_words(secret, total - sum(map(len, words))))
         # In random order, because sorting keeps the order of equal rotations.
-        every = np.concatenate(words)[random_order(secret, "appended/order", total)]
-        return Gaussians.cat([model, to_gaussians(sort_by_rotation(every), to_world, model.sh_degree)])
+        ordered = np.concatenate(words)[random_order(secret, "appended/order", total)]
+        return Gaussians.cat([model, to_gaussians(sort_by_rotation(ordered), to_world, model.sh_degree)])
 
 
 @dataclass(frozen=True)
@@ -173,23 +161,17 @@ class AppendedReader(SaltedReader):
 
     def extract(self, key: DerivedKey) -> Payload:
         """See `SaltedReader`."""
+        data_key = container.key_secret(key)
         for width in (_WIDE, _NARROW):
-            header = read_header(key.expand(f"appended/header/{width}", 32), self.words, width)
-            if header:
-                numbers, data = read_packets(key.expand("appended/packets", 32), self.words, width)
-                whole = _codewords(header, width).decode(numbers.astype(np.int64), data, errors=True)
-                own = _masked(key, whole[: cover_filters.BYTES])
-                encrypted = whole[cover_filters.BYTES :]
-                packed = decrypt(key.expand("appended/data", 32), encrypted, _ASSOCIATED + own)
-                foreign = cover_filters.foreign_count(
-                    own, self.model, self.to_own, _filter_key(key), _FOREIGN
-                )
-                return replace(unpack_payload(packed), foreign=foreign)
+            needed = read_header(expand(data_key, f"header/{width}", 32), self.words, width)
+            if needed:
+                numbers, data = read_packets(expand(data_key, "packets", 32), self.words, width)
+                codewords = _codewords(needed, width)
+                shards = numbers.astype(np.int64), data
+                record, payload = container.unseal_shards(data_key, codewords, *shards, COARSE_BYTES)
+                foreign = coarse_foreign(record, data_key, self.model, self.to_own)
+                return replace(payload, foreign=foreign)
         raise WrongKeyError()
-
-
-def _filter_key(key: DerivedKey) -> bytes:
-    return key.expand("appended/host", 32)
 
 
 def _bucket(size: int) -> int:
@@ -198,18 +180,19 @@ def _bucket(size: int) -> int:
     return -(-size // step) * step
 
 
-def _padded_count(used: int) -> int:
-    """The number of Gaussians to append if `used` carry data: one of few numbers, which reveal little."""
+def _padded_count(every: Sequence[Codewords]) -> int:
+    """The number of Gaussians to append for payloads in these codewords: one of few, which reveal little."""
+    used = sum(HEADERS + each.shards for each in every)
     total = _bucket(used)
     while total - pilots.count_for(total) < used:
         total = _bucket(total + 1)
     return total
 
 
-def _codewords_for(size: int, single: bool) -> Codewords:
-    """The codewords for a compressed payload of `size` bytes. Raises UsageError if it does not fit."""
-    for width, most in ((_WIDE, _WIDE_PACKETS * single), (_NARROW, _MAX_PACKETS)):
-        needed = -(-(size + OVERHEAD) // width)
+def _codewords_for(size: int, secrets: int) -> Codewords:
+    """The codewords for a sealed payload of `size` bytes. Raises UsageError if it does not fit."""
+    for width, most in ((_WIDE, _WIDE_PACKETS if secrets == 1 else 0), (_NARROW, _MAX_PACKETS)):
+        needed = -(-size // width)
         if needed <= most:
             return _codewords(needed, width)
     raise UsageError(f"the secret takes {size:,} bytes, and {MAX_BYTES:,} can be appended")
@@ -234,32 +217,17 @@ def _shifts_with_pilots(steps: Doubles, colours: Integers) -> Iterator[float]:
             yield float(shifts[index])
 
 
-def _words(key: DerivedKey, own: bytes, packed: bytes, single: bool) -> Bits:
-    """Words [N, WORD_BITS] of the headers and packets of a payload; `single`: there is only one secret.
-
-    `own`: the cover's Bloom filter, which is masked and authenticated with the payload.
-    """
-    codewords = _codewords_for(compressed_size(packed) + len(own), single)
+def _words(data_key: bytes, codewords: Codewords, sealed: bytes) -> Bits:
+    """Words [N, WORD_BITS] of the headers and packets of a sealed payload."""
     width, needed = codewords.width, codewords.count * codewords.k
-    size = codewords.size - len(own)
-    encrypted = encrypt(key.expand("appended/data", 32), packed, _ASSOCIATED + own, size=size)
-    data = _masked(key, own) + encrypted
+    noise = np.frombuffer(stream(data_key, "header-noise", HEADERS * width), np.uint8)
     numbers = np.arange(codewords.shards, dtype=np.uint64)
-    noise = np.frombuffer(key.expand("appended/header-noise", HEADERS * width), np.uint8).reshape(
-        HEADERS, width
-    )
     return np.concatenate(
         [
-            write_header(key.expand(f"appended/header/{width}", 32), needed, noise),
-            write_packets(key.expand("appended/packets", 32), numbers, codewords.encode(data)),
+            write_header(expand(data_key, f"header/{width}", 32), needed, noise.reshape(HEADERS, width)),
+            write_packets(expand(data_key, "packets", 32), numbers, codewords.encode(sealed)),
         ]
     )
-
-
-def _masked(key: DerivedKey, own: bytes) -> bytes:
-    """The cover's Bloom filter, encrypted or decrypted."""
-    mask = np.frombuffer(stream(key.master, "appended/cover", len(own)), np.uint8)
-    return (np.frombuffer(own, np.uint8) ^ mask).tobytes()
 
 
 def _random_words(secret: bytes, count: int) -> Bits:

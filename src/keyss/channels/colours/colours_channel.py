@@ -9,7 +9,6 @@ one.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -17,18 +16,8 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from keyss.channels.base import (
-    METHOD_BYTES,
-    NOT_INDEPENDENT,
-    Capacity,
-    Channel,
-    Payload,
-    check_keys,
-    pack_payload,
-    randomness,
-    unpack_payload,
-    warned,
-)
+from keyss.channels import container
+from keyss.channels.base import Capacity, Channel
 from keyss.channels.colours.carriers import SALTS, Carriers, find_salts
 from keyss.channels.colours.fountain import Fountain
 from keyss.channels.colours.header import (
@@ -43,20 +32,20 @@ from keyss.channels.colours.header import (
 )
 from keyss.channels.colours.planner import MIN_HEADERS, Layout, Planner, bucket_of
 from keyss.channels.colours.qim import COLUMNS, ONE, bit_counts, read, seeds, write
+from keyss.channels.container import Payload
 from keyss.channels.reed_solomon import LOST
 from keyss.core.arrays import Doubles, Flags
-from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError
+from keyss.core.errors import InputError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.keys.derivation import MASTER_BYTES, expand, stream
-from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
+from keyss.keys.encryption import OVERHEAD
 
 _TOO_FEW = "this cover has too few Gaussians to hide anything in colours that would survive other formats"
 _LOWER = 3  # maximum number of levels, each a quarter of a bit, below the planned one
 _BITS_PER_GAUSSIAN = 1  # approximate capacity
 _HEADERS = 100  # approximate bytes
 _FURTHER = 0.8  # approximate share of the capacity that another secret leaves
-_OVERHEAD = METHOD_BYTES + 1  # maximum bytes of a payload beside its data
-_ASSOCIATED = b"keyss/v1/colours"  # associated data of a payload's authentication
+_OVERHEAD = container.METHOD_BYTES + 1  # maximum bytes of a payload beside its data
 _CHANGED = 0.03  # share of carriers overwritten since
 _MAX_RATE = 4.0  # data bits per code bit; a writer stays below 0.5
 _ALIGNMENTS = 4  # offsets of log scales; the best one is wrong by at most 1/8 step in a scaled model
@@ -74,8 +63,7 @@ class Colours(Channel):
         return ColoursCover(Planner(cover, Carriers.of(cover)))
 
     def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
-        capacity = gaussians * _BITS_PER_GAUSSIAN // 8 - _HEADERS
-        return Capacity(max(0, capacity), _OVERHEAD, _FURTHER)
+        return _capacity(gaussians * _BITS_PER_GAUSSIAN // 8 - _HEADERS, _FURTHER)
 
 
 COLOURS = Colours()
@@ -96,20 +84,20 @@ class ColoursCover:
 
     @cached_property
     def capacity(self) -> Capacity:
-        return Capacity(self.planner.bytes, _OVERHEAD, self.planner.share_with_another)
+        return _capacity(self.planner.bytes, self.planner.share_with_another)
 
     def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Also raises UsageError for a model that can carry nothing."""
-        packed = [pack_payload(payload) for _, payload in payloads]
-        secret = randomness(entropy, *packed)
+        contents = [payload for _, payload in payloads]
+        secret = container.randomness(entropy, contents)
         random = np.random.default_rng(np.frombuffer(stream(secret, "colours/random", 32), np.uint32))
         carriers = self.planner.carriers
         salt_rows, salts = find_salts(carriers)
         if len(salts) < SALTS:
             raise UsageError(_TOO_FEW)
         secrets = [Secrets.of(key, salts) for key, _ in payloads]
-        check_keys([each.static for each in secrets])
-        sizes = [compressed_size(each) + OVERHEAD for each in packed]
+        container.check_keys([each.static for each in secrets])
+        sizes = list(map(container.sealed_size, contents))
         found = self.planner.layouts(sizes)
         if found is None:
             raise UsageError(
@@ -118,7 +106,7 @@ class ColoursCover:
             )
         layouts, reveals_others = found
         if reveals_others:
-            warnings.warn(NOT_INDEPENDENT, KeyssWarning, stacklevel=3)
+            container.warn_of_others()
         # Headers without a secret hide the number of secrets. Above level ONE, others are noticed anyway.
         for index in range(len(secrets), MIN_HEADERS if layouts[0].level == ONE else 0):
             labels = [f"colours/nobody/{index}/{each}" for each in range(SALTS + 1)]
@@ -131,7 +119,7 @@ class ColoursCover:
         headers = self._headers(layouts, sizes, file_key, carriers, _without_places(free, secrets, carriers))
         for lower in range(_LOWER + 1):  # the plan does not include the cost of headers and salts
             lowered = [replace(each, level=each.level and max(1, each.level - lower)) for each in headers]
-            stego = self._write(secrets, lowered, layouts, packed, carriers, free, random)
+            stego = self._write(secrets, lowered, layouts, contents, carriers, free, random)
             if layouts[0].level == ONE or not self.planner.is_visible(stego):
                 break
         return stego
@@ -161,7 +149,7 @@ class ColoursCover:
         secrets: Sequence[Secrets],
         headers: Sequence[Header],
         layouts: Sequence[Layout],
-        payloads: Sequence[bytes],
+        payloads: Sequence[Payload],
         carriers: Carriers,
         free: Flags,
         random: np.random.Generator,
@@ -181,9 +169,9 @@ class ColoursCover:
                 chosen[rows] = layouts[like].likely and self.planner.headers_may_skip
         for each, header, layout, payload in zip(secrets, headers, layouts, payloads, strict=False):
             rows, key = np.flatnonzero(free & header.carrier_mask(carriers)), each.data_key(header)
-            encrypted = encrypt(key, payload, _ASSOCIATED, size=bucket_bytes(header.bucket))
+            sealed = container.seal(key, payload, bucket_bytes(header.bucket))
             ids, bits = carriers.ids[rows], bit_counts(carriers.impact[rows], header.level)
-            data = np.unpackbits(np.frombuffer(encrypted, np.uint8))
+            data = np.unpackbits(np.frombuffer(sealed, np.uint8))
             code = Fountain(len(data)).encode(data, seeds(key, "seeds", ids, bits))
             values[rows], chosen[rows] = write(key, ids, values[rows], bits, code), layout.likely
         new = self.planner.statistics.imitate(values)
@@ -207,7 +195,7 @@ class ColoursReader:
         return ColoursReader(tuple(Carriers.of(model, each / _ALIGNMENTS) for each in range(_ALIGNMENTS)))
 
     def open(self, key: str) -> Payload:
-        """See `keyss.channels.base.Reader`.
+        """See `SaltedReader`.
 
         Takes about 0.1 s for each of 17 salts, for right and wrong keys alike.
         """
@@ -217,20 +205,23 @@ class ColoursReader:
             if header is None:
                 continue
             for shift in (0.0,) if header.level == ONE else (0.0, header.shift(carriers)):
-                found = _payload(header, secrets, carriers, shift)
-                if found is not None:
-                    share = found[1] if found[1] > _FOREIGN else 0.0
-                    return warned(replace(unpack_payload(found[0]), foreign=round(share * len(carriers))))
+                payload = _payload(header, secrets, carriers, shift)
+                if payload is not None:
+                    return container.warned(payload)
         if any(headers):
             raise InputError(LOST)
         _payload(_NOTHING, secrets, self.alignments[0], 0.0)
         raise WrongKeyError()
 
 
-def _payload(
-    header: Header, secrets: Secrets, carriers: Carriers, shift: float
-) -> tuple[bytes, float] | None:
-    """The payload decrypted by the header's data key, and the share of foreign carriers; or None."""
+def _capacity(size: int, further: float) -> Capacity:
+    """`size`: of a packed payload; `further`: factor on the total for each further payload."""
+    shares = [(1.0, size)]
+    return Capacity.of_sealed(_OVERHEAD, shares, lambda count: int(size * further ** (count - 1)) // count)
+
+
+def _payload(header: Header, secrets: Secrets, carriers: Carriers, shift: float) -> Payload | None:
+    """The payload decrypted by the header's data key, or None."""
     rows = np.flatnonzero(_without_places(header.carrier_mask(carriers), [secrets], carriers))
     size, key, ids = bucket_bytes(header.bucket), secrets.data_key(header), carriers.ids[rows]
     bits = bit_counts(carriers.impact[rows] - shift, header.level)
@@ -240,13 +231,14 @@ def _payload(
     values, words = read(key, ids, carriers.colours[rows, 1:], bits), seeds(key, "seeds", ids, bits)
     found = Fountain(8 * size).decode(words, np.repeat(sure, COLUMNS * bits) * values)
     try:
-        payload = decrypt(key, np.packbits(found).tobytes(), _ASSOCIATED)
+        payload = container.unseal(key, np.packbits(found).tobytes())[1]
     except InputError:
         return None
     agreement = values * (1 - 2.0 * Fountain(8 * size).encode(found, words))
     held = np.repeat((1 - header.idle * IDLE) * carriers.stability[rows], COLUMNS * bits)
     weights = np.repeat(carriers.weights[rows], COLUMNS * bits)
-    return payload, _foreign_share(agreement, held, weights)
+    share = _foreign_share(agreement, held, weights)
+    return replace(payload, foreign=round(share * len(carriers)) if share > _FOREIGN else 0)
 
 
 def _foreign_share(agreement: Doubles, held: Doubles, weights: Doubles) -> float:

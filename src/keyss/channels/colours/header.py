@@ -21,6 +21,7 @@ import numpy as np
 from keyss.channels.colours.carriers import Carriers, fractions
 from keyss.channels.colours.fountain import NOISY, Fountain
 from keyss.channels.colours.qim import COLUMNS, ONE, read, seeds, write
+from keyss.channels.container import key_secret
 from keyss.core.arrays import Doubles, Flags, Integers
 from keyss.keys.derivation import SALT_BYTES, DerivedKey, expand
 
@@ -55,8 +56,8 @@ class Secrets:
         Because of the salts, an attacker pays for Argon2id again in every file. The static secret compensates
         for the small redundancy of a header: an attacker must guess both.
         """
-        salted = tuple(DerivedKey.of(key, salt).expand("colours/header", 32) for salt in salts)
-        return Secrets(DerivedKey.of(key, _STATIC_SALT).expand("colours/static", 32), salted)
+        salted = tuple(key_secret(DerivedKey.of(key, salt)) for salt in salts)
+        return Secrets(key_secret(DerivedKey.of(key, _STATIC_SALT)), salted)
 
     def data_key(self, header: Header) -> bytes:
         """The key that encrypts the payload in this file."""

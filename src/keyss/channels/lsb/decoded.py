@@ -1,7 +1,7 @@
 """Models that were decoded from a .spz, .sog or compressed .ply, like most models on the web.
 
-The codes of that file determine their low bits, so new low bits would show. `quantise` computes the codes
-from the numbers. The secret is embedded in the codes, and the published model is decoded from them.
+The quantised values of that file determine their low bits, so new low bits would show. `quantise` computes
+these values from the floats. The secret is embedded in them, and the published model is decoded from them.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ _MIN_EXACT = 0.9  # share of exact Gaussians
 
 @dataclass(frozen=True)
 class Decoded:
-    """A model and the codes from which it was decoded."""
+    """A model and the quantised values from which it was decoded."""
 
     model: Gaussians
     codes: Codes
-    exact: Flags  # [N] True if decoding the codes gives the Gaussian's numbers; others carry nothing
+    exact: Flags  # [N] True if decoding gives the Gaussian's numbers; others carry nothing
     order: Integers  # [N] position of each Gaussian in the file
 
     @staticmethod
@@ -62,7 +62,7 @@ class Decoded:
         return is_in_morton_order(self.model.means.numpy()[self.order.argsort()])
 
     def with_codes(self, before: Codes, after: Codes) -> Gaussians:
-        """The model after a change of its codes; both are in its order."""
+        """The model after a change of its quantised values; both are in its order."""
         old, new = before.dequantise(), after.dequantise()
         changes = {}
         for name in _WRITTEN:

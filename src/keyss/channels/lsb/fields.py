@@ -1,7 +1,7 @@
-"""The numbers of a format's codes that carry bits, how many each (docs/byte-layout.md), and in which order.
+"""The quantised values that carry bits, how many each (docs/byte-layout.md), and in which order.
 
 A *level* is an integer that grows with the number it stands for; a *field* is one coordinate of an attribute
-of all Gaussians. The number of bits that a level carries follows from codes that are never written: for
+of all Gaussians. The number of bits that a level carries follows from values that are never written: for
 positions from the Gaussian's size and the format's step, so that they move by a fraction of that size. The
 arithmetic is the same on every machine and uses no logarithms: a reader must find the same numbers of bits.
 
@@ -10,7 +10,7 @@ odd ones down only, which makes pairs of them equally frequent: the attacks of W
 and of Fridrich et al. (2001) find that.
 
 Bits are counted in the order of the file, except those of a .sog. A .sog is sorted by positions, which carry
-bits, so its bits are counted in the order of hashes of the codes that carry none.
+bits, so its bits are counted in the order of hashes of the values that carry none.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def in_counted_order(codes: Codes, exact: Flags | None = None) -> tuple[Integers
 
 
 def model_hash(codes: Any, decoded: Gaussians | None = None) -> bytes:
-    """12 bytes of a hash of colours and opacities, which never change: those of `decoded`, else the codes.
+    """12 bytes of a hash of colours and opacities, which never change: those of `decoded`, else of `codes`.
 
     It binds blocks to their model: blocks copied into another one open nothing. Gaussians are in counted
     order, without those of a .sog with equal hashes, whose order is undefined.
@@ -167,7 +167,7 @@ def in_rows(codes: Codes, rows: Integers) -> Any:
 
 
 def _sog_hashes(codes: SogCodes) -> Words:
-    """[N] hashes of the codes that are never written."""
+    """[N] hashes of the values that are never written."""
     parts = (codes.scales, codes.colors, codes.alphas, codes.labels, codes.largest)
     levels = sog_distances(codes, codes.positions)
     return row_hashes(np.concatenate([each.reshape(len(levels), -1) for each in (*parts, levels)], axis=1))

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from keyss.channels import APPENDED, Capacity, Channel, PreparedCover
-from keyss.channels.base import NOT_INDEPENDENT
-from keyss.core.errors import KeyssWarning, UsageError
+from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.fitting.config import FitConfig
 from keyss.methods.codec.precision import finest_size, prune_to_size, usual_size
@@ -79,7 +77,7 @@ class CarryCapacity:
 
         Raises UsageError if the cover is too small.
         """
-        limits = shares(self.payloads, [secret.finest for secret in secrets])
+        limits = self.payloads.limits([secret.finest for secret in secrets])
         counts = [
             min(secret.count, secret.count * limit // secret.usual)
             for secret, limit in zip(secrets, limits, strict=True)
@@ -97,8 +95,8 @@ class CarryCapacity:
         Warns (KeyssWarning) if the models have less room than they would alone.
         """
         needed = list(map(finest_size, models))
-        warn_of_sharing(self.payloads, needed)
-        limits = shares(self.payloads, needed)
+        self.payloads.warn_of_sharing(needed)
+        limits = self.payloads.limits(needed)
         return [prune_to_size(*model) for model in zip(models, limits, viewpoints, strict=True)]
 
     def appended(self, secrets: Sequence[SecretSize]) -> int:
@@ -106,30 +104,3 @@ class CarryCapacity:
         if not self.payloads.grows:
             return 0
         return APPENDED.appended_count([secret.usual for secret in secrets])
-
-
-def shares(capacity: Capacity, needed: Sequence[int]) -> list[int]:
-    """Maximum bytes of each secret's payload, for secrets that need `needed` bytes at the finest precision.
-
-    Each gets the first share of the capacity that suffices: its precision then does not depend on the others,
-    and its key does not reveal them. If these shares exceed the capacity, or if the model grows, they are
-    equal.
-    """
-    count = len(needed)
-    total = int(capacity.bytes * capacity.further ** (count - 1))
-    steps = capacity.steps or [(1 / part, total // part) for part in (4, 2, 1)]
-    chosen = [
-        next((step for step in steps if size <= step[1] - capacity.overhead), steps[-1]) for size in needed
-    ]
-    limits = [limit for _, limit in chosen]
-    if count > 1 and (capacity.grows or not capacity.divisible or sum(part for part, _ in chosen) > 1):
-        limits = [capacity.equal(count) if capacity.equal else total // count] * count
-    return [max(0, limit - capacity.overhead) for limit in limits]
-
-
-def warn_of_sharing(capacity: Capacity, needed: Sequence[int]) -> None:
-    """Warn (KeyssWarning) if a secret gets fewer bytes than it would alone."""
-    alone = [shares(capacity, [size])[0] for size in needed]
-    limits = shares(capacity, needed)
-    if any(limit < min(size, most) for size, most, limit in zip(needed, alone, limits, strict=True)):
-        warnings.warn(NOT_INDEPENDENT, KeyssWarning, stacklevel=3)

@@ -14,7 +14,7 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.schedule import boost_of
-from keyss.methods.carry.capacity import CarryCapacity, SecretSize, check_appended, shares, warn_of_sharing
+from keyss.methods.carry.capacity import CarryCapacity, SecretSize, check_appended
 from keyss.methods.carry.carried_secret import CarriedSecret
 from keyss.methods.carry.carry_options import FINE_TUNING, CarryOptions
 from keyss.methods.codec.precision import encode_to_size, finest_size
@@ -220,8 +220,8 @@ def embed_models(
     """
     viewpoints, capacity = viewpoints or [*map(Viewpoints.around, models)], cover.capacity
     needed = list(map(finest_size, models))
-    warn_of_sharing(capacity, needed)
-    limits = shares(capacity, needed)
+    capacity.warn_of_sharing(needed)
+    limits = capacity.limits(needed)
     payloads = [
         Payload(CarryOptions.method, encode_to_size(model, limit, short=capacity.grows, viewpoints=views))
         for model, limit, views in zip(models, limits, viewpoints, strict=True)

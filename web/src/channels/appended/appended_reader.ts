@@ -2,23 +2,20 @@
  * Reader of appended Gaussians (docs/channels.md): words of 84 bits, read after a format has rounded them, and packets in words;
  * counterpart of `keyss.channels.appended.appended_channel` and `words`.
  */
-import { ascii, joined, rowsOf, viewOf } from '../../core/bytes.ts';
-import { damaged } from '../../core/errors.ts';
+import { rowsOf, viewOf } from '../../core/bytes.ts';
 import { type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';
 import { moved, type Similarity } from '../../core/similarity.ts';
 import type { Words } from '../../core/words.ts';
 import { encryptBlocks } from '../../keys/aes.ts';
-import { decrypted, type Derive, expand, here, streamWords } from '../../keys/keys.ts';
-import { type Payload, type Reader, unpackPayload } from '../base.ts';
-import { type Codewords, decoded } from '../reed_solomon.ts';
-import { COVER_BYTES, foreignCount } from './cover.ts';
+import { type Derive, expand, here } from '../../keys/keys.ts';
+import { keySecret, type Payload, type Reader, unsealedShards } from '../container.ts';
+import { COARSE_BYTES, coarseForeign } from '../foreign.ts';
+import type { Codewords } from '../reed_solomon.ts';
 import { type Found, LEAST, ONE_IN, pilotsOf, POSITION_BITS, readPilots } from './pilots.ts';
 
 // Gaussians sampled for pilots; number of lattice offsets tried, with at least this many standard deviations more pilots
 // than by chance.
 const [SAMPLE, TRIED, NOT_BY_CHANCE] = [8000, 8, 3];
-const FOREIGN = 0.05; // share that is told
-const ASSOCIATED = ascii('keyss/v1/appended/data');
 
 /** A model's appended Gaussians, prepared for any number of keys. */
 export class AppendedReader implements Reader {
@@ -55,20 +52,13 @@ export class AppendedReader implements Reader {
 
   /** The payload that `key` opens, or null. Raises InputError if too much was lost or changed. */
   async open(key: string, derive: Derive = here): Promise<Payload | null> {
-    const secret = await derive(key, this.salt);
+    const dataKey = keySecret(await derive(key, this.salt));
     for (const width of WIDTHS) {
-      const codewords = readHeader(expand(secret, `appended/header/${width}`), this.words, width);
+      const codewords = readHeader(expand(dataKey, `header/${width}`), this.words, width);
       if (codewords === null) continue;
-      const packets = readPackets(expand(secret, 'appended/packets'), this.words, width);
-      const whole = decoded(codewords, packets, true);
-      if (whole.length < COVER_BYTES) throw damaged();
-      const own = whole.slice(0, COVER_BYTES);
-      const [masked, view] = [viewOf(whole), viewOf(own)];
-      streamWords(secret, 'appended/cover', COVER_BYTES / 4, (word, at) => view.setUint32(4 * at, masked.getUint32(4 * at, true) ^ word, true));
-      const packed = await decrypted(expand(secret, 'appended/data'), whole.subarray(COVER_BYTES), joined(ASSOCIATED, own));
-      const payload = unpackPayload(packed);
-      const foreign = foreignCount(own, this.model, this.toOwn, expand(secret, 'appended/host'), FOREIGN);
-      return foreign ? { ...payload, foreign } : payload;
+      const packets = readPackets(expand(dataKey, 'packets'), this.words, width);
+      const [record, payload] = await unsealedShards(dataKey, codewords, packets, COARSE_BYTES);
+      return { ...payload, foreign: coarseForeign(record, dataKey, this.model, this.toOwn) || undefined };
     }
     return null;
   }

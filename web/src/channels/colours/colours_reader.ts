@@ -5,12 +5,11 @@ import { ascii, joined, quantile } from '../../core/bytes.ts';
 import { InputError, tooMuchLost } from '../../core/errors.ts';
 import type { Gaussians } from '../../core/gaussians.ts';
 import { mix, type Words } from '../../core/words.ts';
-import { decrypted, type Derive, expand, here, SALT_BYTES } from '../../keys/keys.ts';
-import { type Payload, type Reader, unpackPayload } from '../base.ts';
+import { type Derive, expand, here, SALT_BYTES } from '../../keys/keys.ts';
+import { keySecret, type Payload, type Reader, unsealed } from '../container.ts';
 import { type Carriers, carriersOf, chosen, fractions, randomPairs, saltsOf } from './carriers.ts';
 import { Fountain, NOISY } from './fountain.ts';
 
-const ASSOCIATED = ascii('keyss/v1/colours');
 const CHANGED = 0.03; // share of carriers overwritten since
 const MAX_RATE = 4; // data bits per code bit
 const ALIGNMENTS = 4; // offsets of log scales tried
@@ -32,17 +31,15 @@ export class ColoursReader implements Reader {
   /** The payload that `key` opens, or null. Raises InputError for damage. */
   async open(key: string, derive: Derive = here): Promise<Payload | null> {
     const [first, ...others] = await Promise.all([STATIC_SALT, ...this.salts].map((salt) => derive(key, salt)));
-    const salted = others.map((each) => expand(each, 'colours/header'));
-    const secrets = { fixed: expand(first, 'colours/static'), salted };
+    const salted = others.map(keySecret);
+    const secrets = { fixed: keySecret(first), salted };
     const headers = this.alignments.map((carriers) => readHeader(secrets, carriers));
     for (const [index, header] of headers.entries()) {
       if (header === null) continue;
       const carriers = this.alignments[index];
       for (const shift of header.level === ONE ? [0] : [0, shiftOf(header, carriers)]) {
-        const found = await payload(header, secrets, carriers, shift);
-        if (found === null) continue;
-        const [data, share] = [unpackPayload(found.data), found.foreignShare];
-        return share > FOREIGN ? { ...data, foreign: Math.round(share * carriers.count) } : data;
+        const found = await payloadOf(header, secrets, carriers, shift);
+        if (found !== null) return found;
       }
     }
     if (headers.some((each) => each !== null)) throw tooMuchLost();
@@ -50,13 +47,8 @@ export class ColoursReader implements Reader {
   }
 }
 
-interface Found {
-  readonly data: Uint8Array;
-  readonly foreignShare: number; // of the carriers
-}
-
 /** The payload decrypted by the header's key, or null. */
-async function payload(header: Header, secrets: Secrets, carriers: Carriers, shift: number): Promise<Found | null> {
+async function payloadOf(header: Header, secrets: Secrets, carriers: Carriers, shift: number): Promise<Payload | null> {
   const rows = ownRows(header, secrets, carriers);
   const own = chosen(carriers, rows);
   const bits = bitCounts(own.impact.map((each) => each - shift), header.level);
@@ -68,16 +60,17 @@ async function payload(header: Header, secrets: Secrets, carriers: Carriers, shi
   if (8 * header.size > MAX_RATE * sure.length) return null;
   const [values, seeds, code] = [readBits(header.key, own, bits), seedsOf(header.key, 'seeds', own, bits), new Fountain(8 * header.size)];
   const found = code.decode(seeds, values.map((value, at) => value * sure[at]));
-  let data: Uint8Array;
+  let payload: Payload;
   try {
-    data = await decrypted(header.key, packBits(found), ASSOCIATED);
+    payload = (await unsealed(header.key, packBits(found)))[1];
   } catch (error) {
     if (error instanceof InputError) return null;
     throw error;
   }
   const written = code.encode(found, seeds);
   const agreement = values.map((value, at) => value * (1 - 2 * written[at])); // -1 to 1
-  return { data, foreignShare: foreignShareOf(agreement, header, own, bits, partWeights(carriers, rows)) };
+  const share = foreignShareOf(agreement, header, own, bits, partWeights(carriers, rows));
+  return share > FOREIGN ? { ...payload, foreign: Math.round(share * carriers.count) } : payload;
 }
 
 /** Weights of `rows` as a part of the model: by area x opacity up to the mean, equal IDs once. */

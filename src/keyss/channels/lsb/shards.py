@@ -1,4 +1,4 @@
-"""What a key finds in the low bits of Gaussians by their IDs alone.
+"""Shards and messages in slots with IDs, the low bits of Gaussians.
 
 Everything follows from a pseudo-random function of a secret and each Gaussian's ID, AES-256: Gaussians may
 have any order, and nothing marks a carrier. No pad is used twice, because every secret here is new for every
@@ -23,6 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from keyss.channels.container import PARAMETER_BYTES
 from keyss.channels.mixing import encrypted_blocks
 from keyss.channels.reed_solomon import SYMBOL_BYTES, Codewords
 from keyss.core.arrays import Bytes, Flags, Integers
@@ -47,6 +48,11 @@ def function(secret: bytes, label: str, ids: Bytes, size: int = _BLOCK) -> Bytes
         return encrypted_blocks(key, counted).reshape(stop - start, -1)[:, :size]
 
     return np.concatenate([np.empty((0, size), np.uint8), *in_blocks(work, len(ids), _ROWS)])
+
+
+def parameter_pads(data_key: bytes, ids: Bytes) -> Bytes:
+    """[N, PARAMETER_BYTES] what encrypts parameters that slots with `ids` [N, 16] hold as a whole."""
+    return function(data_key, "parameters/pad", ids, PARAMETER_BYTES)
 
 
 @dataclass(frozen=True)

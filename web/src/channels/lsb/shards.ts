@@ -1,10 +1,11 @@
 /**
- * What a key finds in the low bits of Gaussians by their IDs alone; counterpart of `keyss.channels.lsb.spread`
+ * Shards and messages in slots with IDs, the low bits of Gaussians; counterpart of `keyss.channels.lsb.shards`
  * (docs/byte-layout.md, "Messages" and "Shards").
  */
 import { bytesKey, mostFrequent, rowsOf, viewOf } from '../../core/bytes.ts';
 import { encryptBlocks } from '../../keys/aes.ts';
 import { expand } from '../../keys/keys.ts';
+import { PARAMETER_BYTES } from '../container.ts';
 import type { Codewords } from '../reed_solomon.ts';
 
 const ID_BYTES = 16;
@@ -25,6 +26,11 @@ function functionOf(secret: Uint8Array, label: string, ids: Uint8Array, size = B
     for (let row = 0; row < count; row++) found.set(values.subarray(row * BLOCK, row * BLOCK + end), row * size + block * BLOCK);
   }
   return found;
+}
+
+/** [N, PARAMETER_BYTES] what encrypts parameters that slots with `ids` [N, 16] hold as a whole. */
+export function parameterPads(dataKey: Uint8Array, ids: Uint8Array): Uint8Array {
+  return functionOf(dataKey, 'parameters/pad', ids, PARAMETER_BYTES);
 }
 
 /** Low bits of Gaussians: rows of `width` bytes. */

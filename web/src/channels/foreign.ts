@@ -1,10 +1,44 @@
-/** What a payload knows of its cover: a Bloom filter of its Gaussians; counterpart of `keyss.channels.appended.cover`. */
-import { viewOf } from '../../core/bytes.ts';
-import { coefficients, type Gaussians, opacity } from '../../core/gaussians.ts';
-import { movedPoint, type Similarity } from '../../core/similarity.ts';
-import { encryptBlocks } from '../../keys/aes.ts';
-import { expand } from '../../keys/keys.ts';
-import { foreignShare, ID_BYTES } from '../base.ts';
+/** Foreign Gaussians: added to a model, or changed, after secrets were hidden; counterpart of `keyss.channels.foreign`. */
+import { viewOf } from '../core/bytes.ts';
+import { coefficients, type Gaussians, opacity } from '../core/gaussians.ts';
+import { movedPoint, type Similarity } from '../core/similarity.ts';
+import { sortingOrder } from '../core/words.ts';
+import { encryptBlocks } from '../keys/aes.ts';
+import { expand } from '../keys/keys.ts';
+
+export const ID_BYTES = 16;
+
+/**
+ * The share, 0 to 1, of foreign Gaussians among those with `ids` [N, 16], by the Bloom filter `own`; equal IDs count once.
+ * `among`: places that each Gaussian hashes to, or for all of them the number of the filter's Gaussians. 1 if less than a share
+ * `gone` of the filter's sample, rounded down, is there.
+ */
+function foreignShare(
+  secret: Uint8Array, ids: Uint8Array, own: Uint8Array, among: number | readonly number[], gone = 0,
+): number {
+  const kept = 8 * own.length;
+  const isUnset = (place: number): boolean => ((own[place >>> 3] >>> (place & 7)) & 1) === 0;
+  const bits = typeof among === 'number' ? Math.min(kept, among) : kept;
+  const unset = Array.from({ length: bits }, (_, place) => place).filter(isUnset).length;
+  const hashed = viewOf(encryptBlocks(expand(secret, 'bloom'), ids));
+  const sampled = new Map<number, number>(); // the place of each different ID
+  for (let row = 0; row < ids.length / ID_BYTES; row++) {
+    const [low, high] = [hashed.getUint32(ID_BYTES * row, true), hashed.getUint32(ID_BYTES * row + 4, true)];
+    const place = low % Math.max(1, typeof among === 'number' ? among : among[row]);
+    if (place < kept) sampled.set(low * 2 ** 21 + (high >>> 11), place);
+  }
+  if (sampled.size < Math.floor(gone * (bits - unset))) return 1;
+  const found = [...sampled.values()].filter(isUnset).length;
+  return Math.min(1, found / Math.max(1e-9, (sampled.size * unset) / Math.max(1, bits)));
+}
+
+export const EXACT_BYTES = 4 + 32;
+
+/** About how many of the Gaussians with `ids` [N, 16] are foreign, by the record of exact IDs. */
+export function exactForeign(record: Uint8Array, secret: Uint8Array, ids: Uint8Array): number {
+  const share = foreignShare(secret, ids, record.subarray(4), viewOf(record).getUint32(0, true));
+  return Math.ceil((share * ids.length) / ID_BYTES);
+}
 
 // Of three positions (in sides of the cube), three log scales, opacity and three colours: bins, and maximum rounding errors.
 const BINS = [1 / 16, 1 / 16, 1 / 16, 0.5, 0.5, 0.5, 0.1, 0.3, 0.3, 0.3];
@@ -15,14 +49,15 @@ const VISIBLE = 3.5 / 255; // minimum opacity; 8 bits round none across it
 const BLOOM_BYTES = 128;
 
 const [MORE, GONE] = [1.25, 0.02]; // factor by which formats may increase the number of faint Gaussians; share of the sample
+const LEAST_SHARE = 0.05; // of foreign Gaussians that is told
 const BLOOM = 16; // after four numbers
 const POSITIONS = 3; // the first numbers
 
-export const COVER_BYTES = BLOOM + BLOOM_BYTES;
+export const COARSE_BYTES = BLOOM + BLOOM_BYTES;
 
-/** About how many of a model's Gaussians are foreign to the cover that `packed` describes; 0 if they are at most a `share`. */
-export function foreignCount(packed: Uint8Array, model: Gaussians, toOwn: Similarity, secret: Uint8Array, share: number): number {
-  const view = viewOf(packed);
+/** About how many of a model's Gaussians are foreign, by the record of coarse IDs; 0 if they are at most a LEAST_SHARE. */
+export function coarseForeign(record: Uint8Array, secret: Uint8Array, model: Gaussians, toOwn: Similarity): number {
+  const view = viewOf(record);
   const [before, faint] = [view.getUint32(0, true), model.opacityLogits.reduce((sum, each) => sum + Number(opacity(each) <= VISIBLE), 0)];
   const outsideBefore = view.getUint32(4, true);
   const [count, area] = [Math.max(1, view.getUint32(8, true)), Math.max(1e-30, view.getFloat32(12, true))];
@@ -42,10 +77,10 @@ export function foreignCount(packed: Uint8Array, model: Gaussians, toOwn: Simila
   }
   const own = new Uint8Array(ids.buffer, 0, ID_BYTES * among.length);
   const visible = model.count - faint;
-  const found = foreignShare(secret, own, packed.subarray(BLOOM), among, GONE);
-  let sure = found > share ? Math.round(found * visible) : 0;
+  const found = foreignShare(secret, own, record.subarray(BLOOM), among, GONE);
+  let sure = found > LEAST_SHARE ? Math.round(found * visible) : 0;
   const outside = rows.filter(isOutside).length;
-  if (outside > outsideBefore + share * visible) sure = Math.max(sure, outside - outsideBefore);
+  if (outside > outsideBefore + LEAST_SHARE * visible) sure = Math.max(sure, outside - outsideBefore);
   return sure + (faint > MORE * before ? faint - before : 0); // a hundred faint ones in one place are visible
 }
 
@@ -92,4 +127,25 @@ function isNearBorder(step: number, at: number): boolean {
 function isOutside(numbers: readonly number[]): boolean {
   const far = numbers.map((each, at) => each <= LOW[at] || each >= HIGH[at]);
   return far.slice(0, POSITIONS).some(Boolean) || far.slice(POSITIONS, 6).filter(Boolean).length > 1;
+}
+
+const [MAX_COPIES, COPIED] = [0.1, 2 / 255]; // share of a sound model; opacity, above that of appended Gaussians
+
+/** The number of visible Gaussians with the position and the red of another, or 0 for no suspicious number. */
+export function copies(model: Gaussians): number {
+  const width = 3 * coefficients(model.shDegree);
+  const rows = [...Array(model.count).keys()].filter((row) => opacity(model.opacityLogits[row]) > COPIED);
+  const numbers = new Float32Array(4 * rows.length);
+  rows.forEach((row, at) => {
+    numbers.set(model.means.subarray(3 * row, 3 * row + 3), 4 * at);
+    numbers[4 * at + 3] = model.sh[width * row];
+  });
+  const words = new Uint32Array(numbers.map((each) => each + 0).buffer); // no negative zeros
+  const order = sortingOrder(words, 4);
+  let found = 0;
+  for (let at = 1; at < order.length; at++) {
+    const [a, b] = [4 * order[at - 1], 4 * order[at]];
+    if ([0, 1, 2, 3].every((word) => words[a + word] === words[b + word])) found++;
+  }
+  return found > MAX_COPIES * rows.length ? found : 0;
 }

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from channels.lsb.trained_like import trained_like
-from keyss.channels import BlockReader, CodesCover, Payload, in_counted_order, last_bits
+from keyss.channels import Payload, QuantisedCover, QuantisedReader, in_counted_order, last_bits
 from keyss.core import Gaussians, WrongKeyError
 from keyss.core.arrays import Bits
 from keyss.files.formats.common import in_morton_order
@@ -38,7 +38,7 @@ def codes_of(suffix: str, count: int = 6000, seed: int = 0, sh_degree: int = 1) 
     return FORMATS[suffix].quantise(model)
 
 
-def written(cover: CodesCover, *payloads: bytes, entropy: bytes = bytes(range(32))) -> Any:
+def written(cover: QuantisedCover, *payloads: bytes, entropy: bytes = bytes(range(32))) -> Any:
     """The codes with payloads under the keys "0", "1" and so on."""
     secrets = [(str(index), Payload("carry", data)) for index, data in enumerate(payloads)]
     return cover.embed(secrets, entropy=entropy).codes
@@ -46,7 +46,7 @@ def written(cover: CodesCover, *payloads: bytes, entropy: bytes = bytes(range(32
 
 def opened(codes: Any, key: str = "0") -> bytes:
     """What a key opens in codes. Raises WrongKeyError and InputError."""
-    reader = BlockReader.of(codes)
+    reader = QuantisedReader.of(codes)
     if reader is None:
         raise WrongKeyError("no room")
     return reader.open(key).data

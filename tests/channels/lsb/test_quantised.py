@@ -10,9 +10,17 @@ import pytest
 import torch
 from hypothesis import given, settings, strategies as st
 
-from channels.lsb.coded import FORMATS, bits_of, codes_of, model_of, opened, there_and_back, written
+from channels.lsb.quantised import FORMATS, bits_of, codes_of, model_of, opened, there_and_back, written
 from files.formats.examples import same_codes
-from keyss.channels import BlockReader, CodesCover, Field, Payload, in_counted_order, last_bits
+from keyss.channels import (
+    Field,
+    Payload,
+    QuantisedCover,
+    QuantisedReader,
+    in_counted_order,
+    last_bits,
+    sealed_size,
+)
 from keyss.channels.lsb.fields import ROTATIONS, sog_distances
 from keyss.channels.lsb.wet_paper import read_blocks
 from keyss.channels.lsb.writable_levels import fixed_axes, writable_levels
@@ -22,22 +30,21 @@ from keyss.files.formats.common import in_morton_order, morton_order
 from keyss.files.formats.compressed_ply import CompressedPlyCodes
 from keyss.files.formats.sog import SogCodes
 from keyss.files.formats.spz import SpzCodes
-from keyss.keys import encryption
 
 ENTROPY = bytes(range(32))
 EVERY = pytest.mark.parametrize("suffix", FORMATS)
 
 
 def blocks(data: bytes, width: int) -> int:
-    """That a payload takes, with those of its key and its parameters."""
-    return 2 + -(-(encryption.compressed_size(data) + encryption.OVERHEAD) // width)
+    """That a payload takes, with that of its parameters."""
+    return 1 + -(-sealed_size(Payload("carry", data)) // width)
 
 
 @EVERY
 @settings(max_examples=6, deadline=None)
 @given(data=st.data())
 def test_any_payloads_of_any_sizes(suffix: str, data: st.DataObject) -> None:
-    cover = CodesCover.of(codes_of(suffix, 3000))
+    cover = QuantisedCover.of(codes_of(suffix, 3000))
     some = st.integers(0, cover.capacity.bytes // 4)
     sizes = data.draw(st.lists(some, min_size=1, max_size=8))
     rng = np.random.default_rng(data.draw(st.integers(0, 99)))
@@ -54,12 +61,12 @@ def test_any_payloads_of_any_sizes(suffix: str, data: st.DataObject) -> None:
 
 @EVERY
 def test_capacity_is_exact(suffix: str) -> None:
-    cover = CodesCover.of(codes_of(suffix))
+    cover = QuantisedCover.of(codes_of(suffix))
     left = len(cover.ids) - 1  # one gives the salt
-    full = np.random.default_rng(1).bytes((left - 2) * cover.width)
+    full = np.random.default_rng(1).bytes((left - 1) * cover.width)
     while blocks(full, cover.width) > left:
         full = full[:-1]
-    assert cover.capacity.bytes - cover.capacity.overhead <= len(full) < cover.capacity.bytes
+    assert cover.capacity.bytes <= len(full) < (left - 1) * cover.width
     assert opened(there_and_back(suffix, written(cover, full))) == full
     with pytest.raises(UsageError, match="room for"):
         written(cover, full + b"\x55")
@@ -72,13 +79,13 @@ def test_what_carries_is_known_from_what_stays(suffix: str) -> None:
     bits = [each.bits for each in in_counted_order(codes)[2]]
     assert sum(int(each.sum()) for each in bits) > 10 * len(codes)
     for round_ in range(3):
-        codes = written(CodesCover.of(codes), b"data", entropy=bytes([round_]) * 32)
+        codes = written(QuantisedCover.of(codes), b"data", entropy=bytes([round_]) * 32)
         assert all(map(np.array_equal, bits, (each.bits for each in in_counted_order(codes)[2])))
 
 
 @EVERY
 def test_levels_move_by_as_little_as_can_be(suffix: str) -> None:
-    cover = CodesCover.of(codes_of(suffix))
+    cover = QuantisedCover.of(codes_of(suffix))
     after = in_counted_order(written(cover, bytes(1000)))[2]
     for old, new, free in zip(cover.fields, after, cover.free, strict=True):
         moved = np.abs(new.levels - old.levels)
@@ -93,7 +100,7 @@ def test_levels_move_by_as_little_as_can_be(suffix: str) -> None:
 @EVERY
 def test_nothing_else_changes(suffix: str) -> None:
     before = codes_of(suffix)
-    after = written(CodesCover.of(before), b"data")
+    after = written(QuantisedCover.of(before), b"data")
     ordered = [in_counted_order(each)[1] for each in (before, after)]
     carrying = {each.name for each in in_counted_order(before)[2]}
     for name in set(vars(before)) - carrying:
@@ -105,7 +112,7 @@ def test_nothing_else_changes(suffix: str) -> None:
 @EVERY
 def test_every_bit_that_may_change_is_written(suffix: str) -> None:
     """Each of them is 0 in half of the files and 1 in the others, however short the payload is."""
-    cover, files = CodesCover.of(codes_of(suffix, 300)), 40
+    cover, files = QuantisedCover.of(codes_of(suffix, 300)), 40
     reads = np.stack([bits_of(written(cover, b"data", entropy=bytes([i]) * 32)) for i in range(files)])
     dry = cover.dry.astype(bool)
     assert 0.8 < dry.mean() < 1
@@ -120,17 +127,17 @@ def test_every_bit_that_may_change_is_written(suffix: str) -> None:
 
 @EVERY
 def test_equal_inputs_give_equal_files_and_others_no_salt_in_common(suffix: str) -> None:
-    cover = CodesCover.of(codes_of(suffix))
+    cover = QuantisedCover.of(codes_of(suffix))
     assert same_codes(written(cover, b"a"), written(cover, b"a"))
     others = [written(cover, b"b"), written(cover, b"a", entropy=bytes(32)), written(cover, b"a", b"b")]
-    salts = {BlockReader.of(each).salts[0] for each in [written(cover, b"a"), *others]}
+    salts = {QuantisedReader.of(each).salts[0] for each in [written(cover, b"a"), *others]}
     assert len(salts) == 4
 
 
 @EVERY
 def test_damage_is_told_from_a_wrong_key(suffix: str) -> None:
     """Except in the few blocks that hold the salt and the header, or nothing."""
-    cover = CodesCover.of(codes_of(suffix))
+    cover = QuantisedCover.of(codes_of(suffix))
     data = np.random.default_rng(0).bytes(cover.capacity.bytes * 9 // 10)
     file = written(cover, data)
     damaged = 0
@@ -147,13 +154,13 @@ def test_damage_is_told_from_a_wrong_key(suffix: str) -> None:
 
 
 def test_equal_keys_no_secrets_and_too_many() -> None:
-    cover = CodesCover.of(codes_of(".spz"))
+    cover = QuantisedCover.of(codes_of(".spz"))
     payload = Payload("carry", b"")
     for secrets in ([], [("key", payload)] * 2):
         with pytest.raises(UsageError, match="each with its own"):
             cover.embed(secrets)
     with pytest.raises(UsageError, match="room for"):
-        cover.embed([(str(i), payload) for i in range(len(cover.ids) // 3 + 1)])
+        cover.embed([(str(i), payload) for i in range(len(cover.ids) // 2 + 1)])
     with pytest.raises(ValueError, match="32 bytes"):
         cover.embed([("key", payload)], entropy=b"short")
 
@@ -161,7 +168,7 @@ def test_equal_keys_no_secrets_and_too_many() -> None:
 @EVERY
 def test_small_models_have_no_room(suffix: str) -> None:
     with pytest.raises(UsageError, match="no room"):
-        CodesCover.of(codes_of(suffix, 100))
+        QuantisedCover.of(codes_of(suffix, 100))
     with pytest.raises(WrongKeyError):
         opened(codes_of(suffix, 100))
 
@@ -171,7 +178,7 @@ def test_columns_on_a_lattice_stay_and_the_rest_carries() -> None:
     positions = codes.positions.copy()
     positions[:, 0] = positions[:, 0] // 64 * 64 + 7
     positions[:, 1] = 1000
-    cover = CodesCover.of(replace(codes, positions=positions))
+    cover = QuantisedCover.of(replace(codes, positions=positions))
     file = written(cover, b"data" * 99)
     assert np.array_equal(file.positions[:, :2], positions[:, :2])
     assert (file.positions[:, 2] != positions[:, 2]).mean() > 0.5
@@ -183,7 +190,7 @@ def test_twins_stay_twins() -> None:
     names = ("positions", "alphas", "colors", "scales", "largest", "rotations", "sh")
     for name in names:
         getattr(codes, name)[100:200] = getattr(codes, name)[:100]
-    file = written(CodesCover.of(codes), b"data")
+    file = written(QuantisedCover.of(codes), b"data")
     assert all(np.array_equal(getattr(file, n)[100:200], getattr(file, n)[:100]) for n in names)
     assert opened(file) == b"data"
 
@@ -191,7 +198,7 @@ def test_twins_stay_twins() -> None:
 def test_rotations_keep_both_zeros() -> None:
     """SPZ has a sign and a magnitude; a number that came from below 0 does not become +0."""
     codes = codes_of(".spz")
-    file = written(CodesCover.of(codes), b"data")
+    file = written(QuantisedCover.of(codes), b"data")
     far = (codes.rotations & 511) > 3
     assert np.array_equal((file.rotations & 512)[far], (codes.rotations & 512)[far])
     zeros = file.rotations[file.rotations & 511 == 0]
@@ -201,7 +208,7 @@ def test_rotations_keep_both_zeros() -> None:
 @EVERY
 def test_the_largest_part_of_a_quaternion_stays_the_largest(suffix: str) -> None:
     """But for those that rounding alone makes, which stay, too."""
-    cover = CodesCover.of(codes_of(suffix, 20_000))
+    cover = QuantisedCover.of(codes_of(suffix, 20_000))
     after = in_counted_order(written(cover, b"data"))[2]
     least, largest = ROTATIONS[type(cover.codes)]
 
@@ -223,7 +230,7 @@ def test_rotations_of_an_old_spz_stay() -> None:
         largest=np.full(len(codes), 3, np.uint8),
         rotations=np.random.default_rng(0).integers(1, 255, (len(codes), 3)).astype(np.uint16),
     )
-    file = SpzCodes.parse(written(CodesCover.of(old), b"data").serialise())
+    file = SpzCodes.parse(written(QuantisedCover.of(old), b"data").serialise())
     assert np.array_equal(file.rotations, old.rotations)
     assert opened(file) == b"data"
 
@@ -236,14 +243,14 @@ def test_sog_stays_in_the_order_of_its_positions() -> None:
 
     plain = SogCodes.quantise(model_of(20_000))
     expected = out_of_order(plain)
-    found = out_of_order(written(CodesCover.of(plain), bytes(5000)))
+    found = out_of_order(written(QuantisedCover.of(plain), bytes(5000)))
     assert expected > 0
     assert abs(found - expected) < 6 * expected**0.5
 
 
 def test_an_spz_in_the_order_of_space_stays_in_order() -> None:
     codes = SpzCodes.quantise(in_morton_order(model_of(20_000)))
-    file = written(CodesCover.of(codes), bytes(5000))
+    file = written(QuantisedCover.of(codes), bytes(5000))
     places = [np.empty(20_000, int) for _ in range(2)]
     for each, own in zip((codes, file), places, strict=True):
         own[morton_order(each.dequantise().means.numpy())] = np.arange(20_000)
@@ -295,7 +302,7 @@ def test_neighbours_with_equal_rotations_keep_them(suffix: str) -> None:
 
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_fewer_change_the_nearer_a_limit_is(suffix: str) -> None:
-    cover = CodesCover.of(codes_of(suffix, 30_000))
+    cover = QuantisedCover.of(codes_of(suffix, 30_000))
     for field, free in zip(cover.fields, cover.free, strict=True):
         if field.name != "rotations":
             continue
@@ -307,7 +314,7 @@ def test_fewer_change_the_nearer_a_limit_is(suffix: str) -> None:
 
 def test_steps_of_a_sog_stay_as_large_as_they_are() -> None:
     codes = codes_of(".sog", 30_000)
-    cover = CodesCover.of(codes)
+    cover = QuantisedCover.of(codes)
     distances = [
         sog_distances(each, each.positions)
         for each in (cover.codes, in_counted_order(written(cover, b"data"))[1])
@@ -318,8 +325,8 @@ def test_steps_of_a_sog_stay_as_large_as_they_are() -> None:
 
 @EVERY
 def test_the_blocks_of_one_file_are_of_no_use_in_another(suffix: str) -> None:
-    """Everybody can read blocks, and write them. But salts and cells depend on colours and opacities."""
-    covers = [CodesCover.of(codes_of(suffix, seed=seed)) for seed in (0, 1)]
+    """Everybody can read blocks, and write them. But salts depend on colours and opacities."""
+    covers = [QuantisedCover.of(codes_of(suffix, seed=seed)) for seed in (0, 1)]
     one, host = sorted(covers, key=lambda each: each.width)
     first = written(one, b"first")
     assert opened(first) == b"first"

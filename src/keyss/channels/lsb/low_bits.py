@@ -1,0 +1,271 @@
+"""The channel in the low bits of floats.
+
+IDs of Gaussians and a key tell where a secret lies (see `shards`), with redundancy: shuffling is harmless,
+and a quarter of the Gaussians may be lost. A file has no magic number and no index of its secrets. Carriers,
+the usable Gaussians, are chosen at random, and unused ones get noise, so the number of secrets does not show.
+
+A *salt* of Argon2id is a hash of one Gaussian that holds nothing else. A salt is *stale* if its Gaussian is
+not usable (see `usable`): the author of the cover knows it in advance, so no key is written under it. A
+reader tries SALTS_TRIED salts; covers with as many stale ones among the first 2 SALTS_TRIED are refused: in
+others, random removal of a quarter leaves it no fresh one with p < 3e-4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import count
+
+import numpy as np
+import torch
+
+from keyss.channels import container
+from keyss.channels.base import Capacity, Channel
+from keyss.channels.container import Payload, SaltedReader
+from keyss.channels.foreign import EXACT_BYTES, exact_foreign, exact_record
+from keyss.channels.lsb.bits import DEEPEST, LEAST, Layout, gaussian_ids, read_low_bits, write_low_bits
+from keyss.channels.lsb.low_bits_capacity import (
+    DATA_KEY_BYTES,
+    MAX_INDEPENDENT,
+    LowBitsCapacity,
+    Plan,
+    codewords_of,
+    key_message,
+    parameter_message,
+)
+from keyss.channels.lsb.shards import Shards, is_tagged, shard_bytes
+from keyss.channels.lsb.usable import Carriers, repeated, salt, salt_rows
+from keyss.channels.mixing import random_order
+from keyss.channels.reed_solomon import Codewords
+from keyss.core.arrays import Bytes, Flags, Integers
+from keyss.core.errors import UsageError, WrongKeyError
+from keyss.core.gaussians import Gaussians
+from keyss.kernels.parallel import in_blocks
+from keyss.keys.derivation import MASTER_BYTES, DerivedKey, expand, fill, stream
+
+Part = tuple[int, Integers, Bytes]  # a depth, rows of the model, and what is written into each
+
+
+class LowBits(Channel):
+    """The channel in the low bits of floats; see `keyss.channels.base.Channel`."""
+
+    place = "low bits"
+
+    def prepare(self, cover: Gaussians) -> LowBitsCover:
+        """See `Channel`. Raises UsageError for low bits that are few or not random, and for stale salts."""
+        layout = Layout.of(cover)
+        carriers = Carriers.of(cover, layout)
+        rows = salt_rows(cover, carriers.ids, layout)
+        first = rows[: 2 * container.SALTS_TRIED]
+        stale = int((~carriers.renewable[first]).sum())
+        if stale >= container.SALTS_TRIED:
+            raise UsageError(
+                f"{stale} of the first {len(first)} salts of this cover cannot be renewed, and whoever "
+                "made it could try keys in advance"
+            )
+        return LowBitsCover(cover, layout, carriers, rows)
+
+    def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
+        return LowBitsCapacity.of(gaussians, Layout(sh_degree)).for_payloads()
+
+
+LOW_BITS = LowBits()
+
+
+@dataclass(frozen=True)
+class LowBitsCover:
+    """A cover and its usable Gaussians; see `keyss.channels.base.PreparedCover`."""
+
+    cover: Gaussians
+    layout: Layout
+    carriers: Carriers
+    salt_rows: Integers  # [S] rows of the salts' Gaussians, in order
+
+    @cached_property
+    def capacity(self) -> Capacity:
+        return self._capacity.for_payloads()
+
+    def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
+        """See `PreparedCover`. Takes 1.6 s for each secret for key derivation."""
+        contents = [payload for _, payload in payloads]
+        mixed = container.randomness(entropy, contents, self.carriers.ids.tobytes())
+        salts = self._salts(mixed)[1]
+        fresh = [salts[index] for index in self.fresh_salts]
+        return self.embed_derived([(_derive(key, fresh), payload) for key, payload in payloads], mixed)
+
+    def embed_derived(
+        self, payloads: Sequence[tuple[Sequence[DerivedKey], Payload]], entropy: bytes
+    ) -> Gaussians:
+        """`embed` after key derivation: each secret comes with its key under each of the `fresh_salts`.
+
+        `entropy`: the result of `randomness`, used for this file only.
+        """
+        container.check_keys([keys[0].master for keys, _ in payloads])
+        parts = [(LEAST, self.salt_rows[self.fresh_salts], self._salts(entropy)[0])]
+        parts += Writer(self._capacity, self._usable, self.carriers.ids, entropy).write(payloads)
+        return write_low_bits(self.cover, self.layout, parts)
+
+    @cached_property
+    def fresh_salts(self) -> Integers:
+        """[F] indices of the salts that are not stale."""
+        return np.flatnonzero(self.carriers.renewable[self.salt_rows])
+
+    @cached_property
+    def _usable(self) -> Flags:
+        """[N] mask of usable Gaussians, without those of salts."""
+        usable = self.carriers.usable[LEAST].copy()
+        usable[self.salt_rows] = False
+        return usable
+
+    @cached_property
+    def _capacity(self) -> LowBitsCapacity:
+        count, depths = int(self._usable.sum()), tuple(self.carriers.usable)
+        return LowBitsCapacity(len(self.cover), count, self.layout, depths)
+
+    def _salts(self, entropy: bytes) -> tuple[Bytes, list[bytes]]:
+        """New low bits [F, B] of the Gaussians of fresh salts, and all salts with these low bits."""
+        width = self.layout.width(LEAST)
+        noise = stream(entropy, "lsb/salts", len(self.fresh_salts) * width)
+        fresh = np.frombuffer(noise, np.uint8).reshape(len(self.fresh_salts), width)
+        rows = self.cover[torch.from_numpy(self.salt_rows)]
+        renewed = write_low_bits(rows, self.layout, [(LEAST, self.fresh_salts, fresh)])
+        low = read_low_bits(renewed, LEAST, self.layout)
+        ids = self.carriers.ids[self.salt_rows]
+        return fresh, [salt(*each) for each in zip(ids, low, strict=True)]
+
+
+@dataclass(frozen=True)
+class Writer:
+    """Writes payloads into the `usable` [N] Gaussians of a model with `ids` [N, 16].
+
+    `entropy`: 32 secret bytes.
+    """
+
+    capacity: LowBitsCapacity
+    usable: Flags
+    ids: Bytes
+    entropy: bytes
+
+    def write(self, payloads: Sequence[tuple[Sequence[DerivedKey], Payload]]) -> list[Part]:
+        """What is to be written, in this order: noise, shards and headers.
+
+        Each payload comes with its key under every salt that is not stale. Raises UsageError for too large
+        payloads. Warns (KeyssWarning) if the holder of one key can tell that there are other secrets.
+        """
+        sizes = [container.sealed_size(payload, EXACT_BYTES) for _, payload in payloads]
+        plan = self.capacity.plan(sizes)
+        if not plan.independent and len(payloads) > 1:
+            container.warn_of_others()
+        rows = np.flatnonzero(self.usable)
+        noise = np.empty((len(rows), self.capacity.layout.width(plan.depth)), np.uint8)
+        fill(self.entropy, "lsb/noise", noise)
+        for attempt in count():  # until no group of shards is too small
+            free = self.usable.copy()
+            headers, data_keys = self._headers(attempt, plan, [keys for keys, _ in payloads], free)
+            left = np.flatnonzero(free)
+            left = left[random_order(self.entropy, f"lsb/shards/{attempt}", len(left))]
+            bodies = list[Part]()
+            for data_key, (_, payload), share in zip(data_keys, payloads, plan.shares, strict=False):
+                own, left = left[: share.carriers], left[share.carriers :]
+                shards = Shards(data_key, share.codewords, is_tagged(noise.shape[1]))
+                if (numbers := shards.numbers(self.ids[own])) is None:
+                    break
+                record = exact_record(data_key, self.ids)
+                sealed = container.seal(data_key, payload, share.codewords.size, record)
+                contents = share.codewords.encode(sealed)[numbers]
+                bodies.append((plan.depth, own, shards.encrypt(self.ids[own], numbers, contents)))
+            else:
+                return [(plan.depth, rows, noise), *headers, *bodies]
+        raise AssertionError
+
+    def _headers(
+        self, attempt: int, plan: Plan, keys: Sequence[Sequence[DerivedKey]], free: Flags
+    ) -> tuple[list[Part], list[bytes]]:
+        """The headers of all secrets, and their data keys; their places are not `free` [N] any more.
+
+        Missing headers take places, too: otherwise collisions would tell how many there are.
+        """
+        total = max(MAX_INDEPENDENT if plan.independent else 0, len(keys))
+        data_keys = [self._secret(f"data-key/{attempt}/{index}", DATA_KEY_BYTES) for index in range(total)]
+        width, parts = self.capacity.layout.width(LEAST), list[Part]()
+        for index in random_order(self.entropy, f"lsb/headers/{attempt}", total).tolist():
+            own: Sequence[DerivedKey] = [
+                DerivedKey(self._secret(f"no-key/{index}/{n}")) for n in range(len(keys[0]))
+            ]
+            packed = b""
+            if index < len(keys):
+                own, code = keys[index], plan.shares[index].codewords
+                packed = container.Parameters(plan.depth, code.count, code.n, code.k).pack(data_keys[index])
+            messages = [(parameter_message(data_keys[index], width), packed)]
+            messages += [(key_message(container.key_secret(key), width), data_keys[index]) for key in own]
+            for message, data in messages:
+                rows, contents = message.write(self.ids, data)
+                if index < len(keys):
+                    parts.append((LEAST, rows[free[rows]], contents[free[rows]]))
+                free[rows] = False
+        return parts, data_keys
+
+    def _secret(self, label: str, size: int = MASTER_BYTES) -> bytes:
+        return expand(self.entropy, f"lsb/{label}", size)
+
+
+@dataclass(frozen=True)
+class LowBitsReader(SaltedReader):
+    """Reads the low bits of a stego model; equal Gaussians count once."""
+
+    stego: Gaussians
+    ids: Bytes  # [N, 16]
+    low: Bytes  # [N, B] at the least depth
+    salts: Sequence[bytes]
+    layout: Layout
+
+    @staticmethod
+    def of(stego: Gaussians) -> LowBitsReader:
+        layout = Layout.of(stego)
+        ids, low = gaussian_ids(stego, layout), read_low_bits(stego, LEAST, layout)
+        rows = _unique_rows(stego, ids, layout)
+        if len(rows) < len(ids):
+            stego, ids, low = stego[torch.from_numpy(rows)], ids[rows], low[rows]
+        salts = [salt(ids[row], low[row]) for row in salt_rows(stego, ids, layout)]
+        return LowBitsReader(stego, ids, low, salts, layout)
+
+    def extract(self, key: DerivedKey) -> Payload:
+        """See `SaltedReader`. A wrong key makes all passes with a data key that matches nothing."""
+        width = self.layout.width(LEAST)
+        data_key = key_message(container.key_secret(key), width).read(self.ids, self.low)
+        packed = parameter_message(data_key, width).read(self.ids, self.low)
+        found = container.Parameters.unpack(packed, data_key)
+        if found is None:
+            none = Codewords(1, 1, 1, shard_bytes(self.layout.width(DEEPEST)))
+            self._shards(data_key, none, DEEPEST)
+            raise WrongKeyError()
+        codewords = codewords_of(found, self.layout)
+        numbers, shards = self._shards(data_key, codewords, found.depth)
+        record, payload = container.unseal_shards(data_key, codewords, numbers, shards, EXACT_BYTES)
+        return replace(
+            payload,
+            shards=(len(np.unique(numbers)), codewords.shards),
+            foreign=exact_foreign(record, data_key, self.ids),
+        )
+
+    def _shards(self, data_key: bytes, codewords: Codewords, depth: int) -> tuple[Integers, Bytes]:
+        """Numbers and data of all shards that seem to be there."""
+        shards = Shards(data_key, codewords, is_tagged(self.layout.width(depth)))
+        return shards.decrypt(self.ids, read_low_bits(self.stego, depth, self.layout))[1:]
+
+
+def _unique_rows(stego: Gaussians, ids: Bytes, layout: Layout) -> Integers:
+    """Rows [M] that differ in `ids` [N, 16] or low bits."""
+    repeats = np.flatnonzero(repeated(ids.view("<u8")[:, 0]))
+    if not len(repeats):
+        return np.arange(len(ids))
+    low = read_low_bits(stego[torch.from_numpy(repeats)], DEEPEST, layout)
+    whole = np.concatenate([ids[repeats], low], axis=1)
+    _, first = np.unique(whole.view(f"S{whole.shape[1]}")[:, 0], return_index=True)
+    return np.setdiff1d(np.arange(len(ids)), np.delete(repeats, first))
+
+
+def _derive(key: str, salts: Sequence[bytes]) -> list[DerivedKey]:
+    """`key` under each salt, several at a time."""
+    return in_blocks(lambda index, _: DerivedKey.of(key, salts[index]), len(salts), 1)
