@@ -13,12 +13,14 @@ file of 10 kB compares with `keyss convert`, which reads and writes the cover. K
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,12 +56,12 @@ def main() -> None:
         (folder / "letter.bin").write_bytes(os.urandom(10_000))
         for count in (3000, options.count):  # the first run compiles
             hidden = max(1, round(options.share * count))
-            write_model(folder / "cover.ply", trained_like(count, 0))
-            write_model(folder / "secret.ply", trained_like(hidden, 1, options.secret_degree))
+            apart(make, folder / "cover.ply", count, 0, 3)
+            apart(make, folder / "secret.ply", hidden, 1, options.secret_degree)
             floor = 0.0
             for step, command in commands(folder, options.format).items():
                 if "lost" in step:
-                    lose(folder / "run/publish/model.ply", folder / "lost.ply")
+                    apart(lose, folder / "run/publish/model.ply", folder / "lost.ply")
                 costs = [run(command) for _ in range(options.repeat if count == options.count else 1)]
                 best = min(costs, key=lambda cost: cost.processor)
                 floor = floor or best.seconds
@@ -69,6 +71,16 @@ def main() -> None:
             found = len(read_model(folder / "revealed.ply"))
             if found != hidden and count == options.count:  # a small cover has room for fewer
                 raise SystemExit(f"{found:,} of {hidden:,} Gaussians were revealed")
+
+
+def apart(function: Callable[..., None], *arguments: Any) -> None:
+    """Call `function` in a process of its own: the memory of this one counts as that of each command."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        pool.submit(function, *arguments).result()
+
+
+def make(out: Path, count: int, seed: int, sh_degree: int) -> None:
+    write_model(out, trained_like(count, seed, sh_degree))
 
 
 def lose(published: Path, out: Path) -> None:

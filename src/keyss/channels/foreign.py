@@ -68,8 +68,8 @@ def copies(model: Gaussians) -> tuple[int, bool]:
 
     Two files of one cover, put into one, have many: no channel changes these numbers.
     """
-    visible = model[model.opacities > _COPIED].detach().to("cpu")
-    rows = torch.cat([visible.means, visible.sh[:, 0, :1]], dim=1).numpy() + np.float32(0)  # no -0
+    visible = torch.cat([model.means, model.sh[:, 0, :1]], dim=1)[model.opacities > _COPIED]
+    rows = visible.detach().cpu().numpy() + np.float32(0)  # no -0
     weights = np.frombuffer(os.urandom(32), np.uint64)  # random: nobody can prepare equal hashes
     count = len(rows) - len(np.unique(rows.view(np.uint32).astype(np.uint64) @ weights))
     return count, count > _MAX_COPIES * len(rows)

@@ -18,8 +18,9 @@ from keyss.channels.names import ConvertedChannel, Format, Publish
 from keyss.core.errors import KeyssWarning, UsageError
 from keyss.fitting.config import FitConfig, preset_for
 
-# Per Gaussian of the cover and of a secret (which ones are usable, encoding, error correction), and per key.
-_COVER_SECONDS, _SECRET_SECONDS, _KEY_SECONDS = 1e-5, 3e-5, 3.0
+# Per Gaussian of the cover and of a secret (encoding, error correction), and per key.
+_COVER_SECONDS, _KEY_SECONDS = 4e-6, 1.0
+_SECRET_SECONDS = 5e-6, 3e-5  # in a cover that does not grow, and in one that does: precision is searched
 _FALLBACK = 'cannot hide this undetectably: {}; falling back to `publish="converted"`, which inspection finds'
 T = TypeVar("T")
 
@@ -285,6 +286,6 @@ def check_above_zero(options: object, *names: str) -> None:
             raise UsageError(f"`{name}`: expected a number above 0, got {value}")
 
 
-def seconds_to_hide(cover: int, secrets: Sequence[int]) -> float:
+def seconds_to_hide(cover: int, secrets: Sequence[int], grows: bool) -> float:
     """About the seconds to hide models of so many Gaussians in a cover, without training, on two cores."""
-    return _COVER_SECONDS * cover + _SECRET_SECONDS * sum(secrets) + _KEY_SECONDS * len(secrets)
+    return _COVER_SECONDS * cover + _SECRET_SECONDS[grows] * sum(secrets) + _KEY_SECONDS * len(secrets)

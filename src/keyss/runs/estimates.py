@@ -25,7 +25,7 @@ _SECONDS = {
     "hide a file": 10.0,
     "export": 1.0,
     "render": 10.0,
-    "prepare": 10.0,
+    "prepare": 7.0,
 }
 
 

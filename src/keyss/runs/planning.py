@@ -90,7 +90,7 @@ def cost_of(
         steps += plain_steps
         trained += size if plain_steps or training.steps else 0
         sizes.append(size)
-    seconds += seconds_to_hide(sizes[0], sizes[1:]) + check_seconds
+    seconds += seconds_to_hide(sizes[0], sizes[1:], prepared.grows) + check_seconds
     appended = _MAX_APPENDED * sum(sizes[1:]) if prepared.grows else 0
     published = sizes[0] + appended
     degree = max(fit.sh_degree if source.given is None else source.given.sh_degree for source in sources)

@@ -82,7 +82,7 @@ def test_every_usable_gaussian_is_written() -> None:
         assert ((counts - counts.mean()) ** 2).sum() / counts.mean() < 255 + 6 * (2 * 255) ** 0.5
         carriers = LowBitsReader.of(stego)
         carried = extract_derived(carriers, own[0])
-        seen.append((carried.shards, len(carried.gaussians)))
+        seen.append((carried.payload.shards, len(carried.gaussians)))
         with pytest.raises(WrongKeyError):
             extract_derived(carriers, keys(3)[0])
     assert seen[0] == seen[1]
@@ -100,8 +100,8 @@ def test_shuffling_and_pruning(cover: Gaussians, secret: Gaussians, seed: int) -
     pruned = stego[order[: len(stego) * 3 // 4]]
     carried = extract_derived(LowBitsReader.of(pruned), salt_of(pruned, own, stego))
     assert carried.gaussians.digest() == whole.gaussians.digest()
-    left, shards = carried.shards
-    assert whole.shards == (shards, shards)
+    left, shards = carried.payload.shards
+    assert whole.payload.shards == (shards, shards)
     assert left == pytest.approx(0.75 * shards, abs=5 * (0.19 * shards) ** 0.5)
     assert not carried.recovered(carried.gaussians).whole
 
@@ -123,7 +123,7 @@ def test_bit_flip_loses_one_shard(cover: Gaussians, secret: Gaussians) -> None:
         name = next(name for name in carriers.salts[:2] if name in names[:3])
         found = extract_derived(carriers, own[names.index(name)])
         assert found.gaussians.digest() == whole.gaussians.digest()
-        assert whole.shards[1] - found.shards[0] <= 1
+        assert whole.payload.shards[1] - found.payload.shards[0] <= 1
 
 
 def _with_flipped_bit(model: Gaussians, row: int, column: int, bit: int) -> Gaussians | None:

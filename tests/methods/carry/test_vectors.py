@@ -50,5 +50,5 @@ def test_pruned_model() -> None:
     order = torch.randperm(len(STEGO), generator=torch.Generator().manual_seed(0))
     carried = extract(STEGO[order[:300]], VECTOR["key"])
     assert len(carried.gaussians) == VECTOR["count"]
-    left, shards = carried.shards
+    left, shards = carried.payload.shards
     assert 0.65 * shards < left < 0.85 * shards

@@ -64,16 +64,20 @@ class Steps:
             in_blocks(search, len(means), _ROWS)
         self.alike = _alike(*self.words)
 
-    def equal(self, depth: int) -> Flags:
-        """Mask [N] of Gaussians that moved by equal amounts, by the bits that stay at a depth."""
+    def equal(self, depth: int, among: Flags | None = None) -> Flags:
+        """Mask [N] of Gaussians that moved by equal amounts, by the bits that stay at a depth.
+
+        `among` [N]: those that did at a larger depth, where steps are less exact.
+        """
+        rows = self.order if among is None else self.order[among[self.order]]
         apart = np.zeros(len(self.order), bool)
 
         def mark(start: int, stop: int) -> None:
-            rows = self.order[start:stop]
-            _mark(rows, self.near, *self.words, depth, _COLOURS, _EQUAL, apart)
-            _mark(rows, self.alike, *self.words, depth, 0, _MANY_EQUAL, apart)
+            own = rows[start:stop]
+            _mark(own, self.near, *self.words, depth, _COLOURS, _EQUAL, apart)
+            _mark(own, self.alike, *self.words, depth, 0, _MANY_EQUAL, apart)
 
-        in_blocks(mark, len(apart), _ROWS, _mark)
+        in_blocks(mark, len(rows), _ROWS, _mark)
         return apart
 
     def chance(self, depth: int, usable: Flags) -> float:
@@ -137,9 +141,17 @@ def _alike(geometry: Words32, sh: Words32) -> Integers:
     means = np.nan_to_num(numbers.view(np.float32).astype(np.float64), posinf=0, neginf=0).mean(axis=2)
     kept = [means[:, :1] - means[:, 1:] * signs for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
     count = min(_ALIKE, max(0, len(means) - 1))
+
+    def search(index: int, _: int) -> Integers:
+        flat = np.pad(kept[index], ((0, 0), (0, 1))).astype(np.float32)
+        order = morton_order(flat)  # what neighbours share stays in the cache
+        found = np.empty((len(order), count), np.int64)
+        found[order] = order[nearest_neighbours(kept[index][order], count + 1)[1][:, 1:]]
+        return found
+
     near = [np.empty((len(means), 0), np.int64)]
     if count:
-        near += in_blocks(lambda index, _: nearest_neighbours(kept[index], count + 1)[1][:, 1:], len(kept), 1)
+        near += in_blocks(search, len(kept), 1)
     alike: Integers = np.concatenate(near, axis=1)
     return alike
 
@@ -242,7 +254,7 @@ def _mark(
 
 @kernel
 def _pairs(rows: Any, near: Any, geometry: Any, sh: Any, depth: int, found: Any) -> int:
-    """List pairs of numbers that differ by equal steps between `rows` and neighbours; returns how many.
+    """List pairs of numbers that differ by equal steps between `rows` and their neighbours; how many.
 
     The next colour counts as a neighbour. `found` [M, 7]: first number of row and neighbour, second number,
     row and neighbour, kind. Lists at most M. Steps of up to two cells are small by chance.

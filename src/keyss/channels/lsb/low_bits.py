@@ -58,7 +58,7 @@ class LowBits(Channel):
         carriers = Carriers.of(cover, layout)
         rows = salt_rows(cover, carriers.ids, layout)
         first = rows[: 2 * container.SALTS_TRIED]
-        stale = int((~carriers.usable[LEAST][first]).sum())
+        stale = int((~carriers.renewable[first]).sum())
         if stale >= container.SALTS_TRIED:
             raise UsageError(
                 f"{stale} of the first {len(first)} salts of this cover cannot be renewed, and whoever "
@@ -109,7 +109,7 @@ class LowBitsCover:
     @cached_property
     def fresh_salts(self) -> Integers:
         """[F] indices of the salts that are not stale."""
-        return np.flatnonzero(self.carriers.usable[LEAST][self.salt_rows])
+        return np.flatnonzero(self.carriers.renewable[self.salt_rows])
 
     @cached_property
     def _usable(self) -> Flags:

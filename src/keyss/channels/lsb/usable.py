@@ -92,6 +92,7 @@ class Carriers:
 
     ids: Bytes  # [N, 16] of all Gaussians
     usable: dict[int, Flags]  # [N] the same mask for each depth at which new low bits do not show
+    renewable: Flags  # [N] mask of those that may be written at the least depth, as salts are
 
     @staticmethod
     def of(gaussians: Gaussians, layout: Layout) -> Carriers:
@@ -104,8 +105,9 @@ class Carriers:
             Carriers.of(sample, Layout.of(sample))
         ids = gaussian_ids(gaussians, layout)
         steps = Steps(gaussians, layout)
-        usable = _without_copies(gaussians, layout, ids) & ~steps.equal(DEEPEST)
-        usable &= _large_enough(gaussians, layout, usable)
+        fine, apart = _without_copies(gaussians, layout, ids), steps.equal(DEEPEST)
+        fine &= _large_enough(gaussians, layout, fine & ~apart)
+        usable = fine & ~apart
         written = dict[int, Flags]()
         for depth in DEPTHS:
             if told := _what_tells(gaussians, layout, usable, depth, steps):
@@ -113,7 +115,7 @@ class Carriers:
                     raise UsageError(told)
                 break
             written[depth] = usable
-        return Carriers(ids, written)
+        return Carriers(ids, written, fine & ~steps.equal(LEAST, apart))
 
 
 def usable_carriers(gaussians: Gaussians) -> Flags:
@@ -221,8 +223,10 @@ def salt_rows(gaussians: Gaussians, ids: Bytes, layout: Layout) -> Integers:
 
 
 def _lateness(gaussians: Gaussians, layout: Layout) -> Words:
-    """[N] 255 for Gaussians that moved by equal steps away from zero; else the octaves by which the smallest
-    even number lies below _LARGE_ENOUGH, 0 for larger ones."""
+    """[N] octaves by which the smallest even number lies below _LARGE_ENOUGH, 0 for larger ones.
+
+    255 for Gaussians that moved by equal steps away from zero.
+    """
 
     def work(start: int, stop: int) -> Words:
         used = used_words(gaussians[start:stop])[:, layout.columns]

@@ -336,8 +336,9 @@ def _warn_of_clipped_scales(log_scales: Floats) -> None:
 
 def _quantised_harmonics(rest: Floats) -> Bytes:
     """[N, K - 1, 3] codes that are multiples of `_SH_STEPS`, which compresses better."""
-    signed = rest * _SH_SIGNS[: rest.shape[1], None]
-    codes = round_half_away(signed.astype(np.float64) * 128) + 128
-    step = _SH_STEPS[: rest.shape[1], None]
-    multiples: Bytes = (np.floor((codes + step // 2) / step) * step).clip(0, 255).astype(np.uint8)
-    return multiples
+    found = np.empty(rest.shape, np.uint8)
+    for at in range(rest.shape[1]):  # one by one saves memory
+        step = _SH_STEPS[at]
+        codes = round_half_away(rest[:, at].astype(np.float64) * _SH_SIGNS[at] * 128) + 128
+        found[:, at] = (np.floor((codes + step // 2) / step) * step).clip(0, 255)
+    return found

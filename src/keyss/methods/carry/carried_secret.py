@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
 
 from keyss.channels import Payload
 from keyss.core.errors import KeyssWarning, UsageError
@@ -17,14 +18,20 @@ from keyss.methods.hidden import Frame, HiddenScene, Recovered
 class CarriedSecret(HiddenScene):
     """A carried secret."""
 
-    gaussians: Gaussians
-    shards: tuple[int, int] | None = None  # see `Payload`
+    payload: Payload
     frame = None
 
     @staticmethod
     def of(payload: Payload) -> CarriedSecret:
         """Read a payload. Raises InputError for damage."""
-        return CarriedSecret(decode(payload.data, payload.model_size), payload.shards)
+        found = CarriedSecret(payload)
+        _ = found.gaussians
+        return found
+
+    @cached_property
+    def gaussians(self) -> Gaussians:
+        """Decoded when it is first needed: until then, a secret takes a fifth of the memory."""
+        return decode(self.payload.data, self.payload.model_size)
 
     def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
         """All Gaussians of the secret."""
@@ -41,7 +48,7 @@ class CarriedSecret(HiddenScene):
         return self.gaussians
 
     def recovered(self, revealed: Gaussians) -> Recovered:
-        return Recovered(len(revealed), len(revealed), self.shards)
+        return Recovered(len(revealed), len(revealed), self.payload.shards)
 
     def fingerprint(self) -> str:
         return hashlib.sha256(self.gaussians.means.numpy().tobytes()).hexdigest()[:16]

@@ -124,7 +124,8 @@ class CarryMethod:
                         photos=secret.photos,
                         name=role_of(index + 1, len(sources)),
                     )
-        with context.waiting("hiding", seconds_to_hide(len(cover.model), [*map(len, models)])):
+        seconds = seconds_to_hide(len(cover.model), [*map(len, models)], prepared.grows)
+        with context.waiting("hiding", seconds):
             stego = embed_models(
                 capacity.prepared,
                 [secret.key for secret in secrets],
@@ -226,11 +227,9 @@ def embed_models(
         for model, limit, views in zip(models, limits, viewpoints, strict=True)
     ]
     stego = cover.embed(list(zip(keys, payloads, strict=True)), entropy=entropy)
-    opened = []
-    for key, model in zip(keys, models, strict=True):
-        opened.append(CarriedSecret.of(open_payload(stego, key)))
-        if len(opened[-1].gaussians) != len(model):
-            raise RuntimeError("the embedded secrets do not open again as they should")
+    opened = [CarriedSecret(open_payload(stego, key)) for key in keys]
+    if [secret.payload.data for secret in opened] != [payload.data for payload in payloads]:
+        raise RuntimeError("the embedded secrets do not open again as they should")
     sizes = [len(payload.data) for payload in payloads]
     details: dict[str, Any] = {
         "secret_bytes": sizes,
