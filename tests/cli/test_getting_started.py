@@ -39,10 +39,10 @@ def test_key_sources_are_equivalent(keyss: Run, monkeypatch: pytest.MonkeyPatch)
 
 def test_cover_without_harmonics(keyss: Run) -> None:
     flat = [word.replace("cover.ply", "flat.ply") for word in HIDE]
-    shown = keyss(*flat, "--secret", "small.ply", "-o", "shown")
+    shown = keyss(*flat, "--secret", "large.ply", "-o", "shown")
     assert shown.status == 0, shown.err
     assert "falling back to --publish converted, which inspection finds" in shown.err.splitlines()[0]
-    refused = keyss(*flat, "--secret", "small.ply", "--format", "ply", "-o", "run")
+    refused = keyss(*flat, "--secret", "large.ply", "--format", "ply", "-o", "run")
     assert refused.status == 7  # few low bits, for a few Gaussians of the secret
     assert "--publish converted keeps all of them" in refused.err
 

@@ -15,6 +15,11 @@ from tiny_scenes import random_gaussians
 FLOORS = {"-y": [0.0, -1, 0], "z": [0, 0, 1], "y": [0, 1, 0], "tilted": [0.1, -0.84, -0.54]}
 
 
+@pytest.fixture(autouse=True)
+def _seed() -> None:
+    torch.manual_seed(0)
+
+
 def subject(count: int = 3000, seed: int = 0) -> Gaussians:
     """Small opaque Gaussians in a ball around the origin."""
     model = random_gaussians(count, seed, 0)
