@@ -147,6 +147,10 @@ def test_render_output_files(run: Path, folders: tuple[Path, Path], tmp_path: Pa
     read = cv2.imread(str(tmp_path / "images" / name))
     assert np.array_equal(read[:, :, ::-1], image.numpy())
     assert len(keyss.render(run / "publish" / "model.ply", folders[0], split="all")) == 16
+    for name in ("turn.mp4", "turn.GIF", "view.png"):
+        with pytest.raises(UsageError, match=r"\.webp"):
+            keyss.render(run / "publish" / "model.ply", out=tmp_path / name)
+        assert not (tmp_path / name).exists()
 
 
 def test_info(run: Path, folders: tuple[Path, Path]) -> None:

@@ -87,7 +87,7 @@ def test_file_from_a_pruned_model(keyss: Run, folder: Path, tmp_path: Path) -> N
 def test_invalid_combinations(keyss: Run, folder: Path, workspace: Path, tmp_path: Path) -> None:
     out, back = tmp_path / "out", tmp_path / "back"
     hide = _arguments(folder, out)
-    assert_refused(keyss(*hide, "--secret", folder / "cover.ply"), 2, "leave out --secret")
+    assert_refused(keyss(*hide, "--secret", folder / "cover.ply"), 2, "scenes or files, not both")
     planned = keyss(*hide, "--dry-run")
     assert (planned.status, planned.out.splitlines()[-1]) == (0, "Dry run: nothing was written.")
     letter = (*_arguments(folder, out)[:3], "--secret", folder / "letter.pdf", *hide[-6:])

@@ -29,6 +29,8 @@ from keyss.runs.run_records import HideMetrics
 
 Split = Literal["test", "train", "all"]
 
+_OTHER_FILES = (".apng", ".avif", ".gif", ".jpeg", ".jpg", ".mkv", ".mov", ".mp4", ".png", ".webm")
+
 
 def render(
     model: PathLike | Gaussians,
@@ -44,11 +46,16 @@ def render(
 
     `views`: how the scene is read; a skipped photo has no camera. Without `cameras`, 60 square images of
     `views.width` pixels, by default 400. `out` gets a PNG for each camera if it is a folder, or
-    an animation if its name ends in .webp. Raises KeyssError.
+    an animation if its name ends in .webp; names of other pictures and films are errors. Raises KeyssError.
     """
     target = resolve_device(device)
     inputs = [Path(model)] if isinstance(model, str | Path) else []
-    animated = out is not None and Path(out).suffix.lower() == ".webp"
+    suffix = "" if out is None else Path(out).suffix.lower()
+    if suffix in _OTHER_FILES:
+        raise UsageError(
+            f"{out}: animations are .webp files; any other name is a folder for images, not a {suffix}"
+        )
+    animated = suffix == ".webp"
     folder = None
     if animated:
         check_not_an_input(str(out), inputs)

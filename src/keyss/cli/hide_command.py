@@ -140,6 +140,8 @@ def hide(args: HideArguments) -> None:
     check_exists(*args.secret, *args.secret_file, *args.key_file, *details.secret_model)
     options = _method_options(args)
     if args.secret_file:
+        if args.secret:
+            raise UsageError("--secret and --secret-file do not go together: hide scenes or files, not both")
         used = "cover secret_file key_file publish format out overwrite device channel dry_run"
         if unused := [name for name in changed_flags(args) if name not in map(flag, used.split())]:
             raise UsageError(f"--secret-file does not use {unused[0]}: leave out {unused[0]}")

@@ -10,9 +10,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from keyss.cli.arguments import (
     Device,
-    Iterations,
     KeyFiles,
-    MaxGaussians,
     OutFolder,
     Overwrite,
     Resume,
@@ -111,8 +109,13 @@ def compare(
     ] = "all",
     out: OutFolder,
     quick: Annotated[bool, switch("500 steps, 3,000 Gaussians and a width of 100 by default.")] = False,
-    iterations: Iterations = None,
-    max_gaussians: MaxGaussians = None,
+    iterations: Annotated[
+        int | None, optional("N", "Training steps for each scene.", "the first method's, or see --quick")
+    ] = None,
+    max_gaussians: Annotated[
+        int | None,
+        optional("N", "Maximum number of Gaussians of a model.", "the first method's, or see --quick"),
+    ] = None,
     width: Width = None,
     dry_run: DryRun = False,
     device: Device = "auto",

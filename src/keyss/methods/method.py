@@ -278,6 +278,11 @@ def role_of(index: int, scenes: int) -> str:
     return "cover" if index == 0 else "secret" if scenes == 2 else f"secret {index}"
 
 
+def role_phrase(role: str) -> str:
+    """The name of a role in a sentence: "the secret", but "secret 2"."""
+    return role if role[-1].isdigit() else f"the {role}"
+
+
 def check_above_zero(options: object, *names: str) -> None:
     """Raise UsageError for an option that is not a finite number above 0."""
     for name in names:

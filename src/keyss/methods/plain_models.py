@@ -9,7 +9,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.plain import fit_scene
-from keyss.methods.method import Context, Source, Training, role_of
+from keyss.methods.method import Context, Source, Training, role_of, role_phrase
 
 
 def fit_plain_models(
@@ -27,7 +27,7 @@ def fit_plain_models(
         for index, (source, config) in enumerate(zip(sources, configs, strict=True))
         if source.given is None
     }
-    titles = [f"plain model of the {role_of(index, len(sources))}" for index in range(len(sources))]
+    titles = [f"plain model of {role_phrase(role_of(index, len(sources)))}" for index in range(len(sources))]
     fitted = _fit_all(missing, "plain model", titles, context)
     return [replace(source, given=fitted.get(index, source.given)) for index, source in enumerate(sources)]
 

@@ -27,6 +27,7 @@ from keyss.methods.method import (
     Stego,
     Training,
     role_of,
+    role_phrase,
     seconds_to_hide,
 )
 from keyss.rendering import contributions
@@ -192,7 +193,7 @@ def fine_tune(
         model=most_contributing(secret, scene, count),
         rate=boost_of(fit) if photos else _MODEL_RATE,
         device=context.device,
-        title=f"fine-tuning of the {name}",
+        title=f"fine-tuning of {role_phrase(name)}",
         **context.loop_arguments(name.replace(" ", "-")),
     ).gaussians
 
