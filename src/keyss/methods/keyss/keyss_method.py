@@ -78,7 +78,7 @@ class KeyssMethod:
         try:
             check_payload_fits(len(probe.payload().data), options.fit.max_gaussians, secrets, shape.sh_degree)
         except UsageError as error:
-            warnings.warn(f"{error}; {_APPENDED}", KeyssWarning, stacklevel=2)
+            warnings.warn(f"method keyss: {error}; {_APPENDED}", KeyssWarning, stacklevel=2)
         plan = replace(options.joint_plan(secrets), notes=(_COST,))
         return Prepared.of(options, len(sources), plan)
 
@@ -109,7 +109,7 @@ class KeyssMethod:
             found = LOW_BITS.prepare(stego).embed(keyed, entropy=entropy)
         except KeyssError as error:
             found = APPENDED.prepare(stego).embed(keyed, entropy=entropy)
-            warnings.warn(f"{error}; {_APPENDED}", KeyssWarning, stacklevel=2)
+            warnings.warn(f"method keyss: {error}; {_APPENDED}", KeyssWarning, stacklevel=2)
             details["appended_because"] = str(error)
         return Stego(found, tuple(map(KeyssSecret.of, payloads)), run.iterations, details)
 
