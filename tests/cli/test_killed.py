@@ -134,14 +134,14 @@ def test_killed_commands_resume(
                 process.send_signal(signum)
             _, err = process.communicate(timeout=600)
         assert "Traceback" not in err, err
-        assert process.returncode in (0, -signum, 128 + signum), err
+        finished = process.returncode == 0 or "holds a finished run" in err  # just before the signal
+        assert finished or process.returncode in (-signum, 128 + signum), err
         again = [*arguments, COMMANDS[name].again]
-        if process.returncode == 0:
+        if finished:
             break
     if process.returncode != 0:
         with start_handling(again, workspace) as process:
             _, err = process.communicate(timeout=600)
-        # It may have finished just before the signal.
         assert process.returncode == 0 or "holds a finished run" in err, err
         assert "Traceback" not in err
     assert result_of(COMMANDS[name], out, run) == expected
