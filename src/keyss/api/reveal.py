@@ -39,8 +39,8 @@ def reveal(
     (`keyss.core.picture_network`), which is no 3DGS model.
 
     `out` (a file) gets the secret: a scene in the format of the suffix (.ply, .spz, ...), or the bytes of a
-    file. Raises UsageError for a suffix that does not suit what the key opens, WrongKeyError for a key that
-    opens nothing, InputError for a damaged file or if less than 10 % of the secret is left. Warns
+    file. Raises UsageError for a suffix of the wrong kind, WrongKeyError for a key that opens nothing,
+    InputError for a damaged file or if less than 10 % of the secret is left. Warns
     (KeyssWarning) of losses and of foreign Gaussians.
     """
     target = resolve_device(device)

@@ -245,7 +245,7 @@ class QuantisedReader(SaltedReader):
 
 
 def _capacity(total: int, width: int) -> Capacity:
-    """Of `total` bytes in blocks of `width`, of which one holds parameters and the last may not be full."""
+    """Of `total` bytes in blocks of `width`: one holds parameters, and the last may not be full."""
     shares = [(1 / part, total // part) for part in (4, 2, 1)]
     return Capacity.of_sealed(2 * width + container.MAX_OVERHEAD, shares, lambda count: total // count)
 
