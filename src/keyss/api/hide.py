@@ -143,15 +143,15 @@ def hide(
             sources = fit_plain_models(sources, prepared.fits, context)
             prepared = chosen.prepare(sources, options, prepared)
         context = replace(context, entropy=_entropy(given.keys, prepared.options, sources))
-        stego = chosen.hide(sources, prepared, context)
         plain = list(map(PlainModel.of, sources, prepared.training, plain_steps))
         results: dict[str, Any] = {**given.models_to_write(sources)}
-        published = with_extras(
-            stego.gaussians, cover if cover_model is None else cover_model, sources[0].model
-        )
         # Images of given models take their place from here on, which frees memory for the revealed ones.
-        prepared = replace(prepared, carrier=None)
+        handed, plain_cover = sources, sources[0].model
         sources = [source if source.photos else replace(source, given=None) for source in sources]
+        stego = chosen.hide(handed, prepared, context)
+        prepared = replace(prepared, carrier=None)
+        published = with_extras(stego.gaussians, cover if cover_model is None else cover_model, plain_cover)
+        del plain_cover
         with reporter.waiting("reading the published file, and comparing renders", cost.check_seconds):
             models = _write_and_read(stego, published, given.keys, folder)
             shown = list(map(partial(compare_with, target), sources, models))
