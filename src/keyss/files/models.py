@@ -68,11 +68,11 @@ def read_model(path: Path | str) -> Gaussians:
         return model_of_bytes("standard input", read_standard_input())
     path = model_file(path)
     if os.path.isdir(path):
-        found = identify_folder(path) or "a folder"
-        raise InputError(f"{path}: expected the file of a 3DGS model ({known_suffixes()}), found {found}")
+        kind = identify_folder(path) or "a folder"
+        raise InputError(f"{path}: expected the file of a 3DGS model ({known_suffixes()}), found {kind}")
     if not os.path.isfile(path):
-        found = "found neither a file nor a folder" if os.path.exists(path) else "but there is no such file"
-        raise InputError(f"{path}: expected a 3DGS model ({known_suffixes()}), {found}")
+        problem = "found neither a file nor a folder" if os.path.exists(path) else "but there is no such file"
+        raise InputError(f"{path}: expected a 3DGS model ({known_suffixes()}), {problem}")
     if is_unpacked_sog(path):
         return model_of_bytes(path.with_suffix(".sog"), pack_unpacked(path))
     with open_input(path) as file:
