@@ -203,9 +203,9 @@ def _print_confirmations(pool: ProcessPoolExecutor, files: Sequence[File]) -> No
         scores = list(pool.map(candidate_scores, *zip(*cases, strict=True), chunksize=4))
         true = [paths.index(file.secret) for file in own]
         found = {
-            name: confirmed(np.array([each[name] for each in scores]).reshape(len(own), len(paths)), true)
+            name: confirmed(np.array([score[name] for score in scores]).reshape(len(own), len(paths)), true)
             for name in scores[0]
-            if all(name in each for each in scores)
+            if all(name in score for score in scores)
         }
         for name, value in sorted(found.items(), key=lambda pair: -abs(pair[1] - 0.5)):
             print(f"| {kind}, {len(own)} files, {len(paths)} candidates | {name} | {value:.3f} |")

@@ -18,8 +18,8 @@ def test_hostile_files_stay_within_limits() -> None:
     command = [sys.executable, hostile.__file__, "--json"]
     output = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False).stdout
     costs = [hostile.Cost(**json.loads(line)) for line in output.splitlines()]
-    assert [each.name for each in costs] == list(hostile.HOSTILE)
-    assert not [each for each in costs if not each.bounded]
+    assert [cost.name for cost in costs] == list(hostile.HOSTILE)
+    assert not [cost for cost in costs if not cost.bounded]
 
 
 def test_picture_names_take_linear_time() -> None:

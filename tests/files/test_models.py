@@ -22,7 +22,7 @@ from keyss.files import (
 from keyss.runs import ModelInfo
 from tiny_scenes import random_gaussians
 
-SUFFIXES = [suffix for each in FORMATS for suffix in each.suffixes]
+SUFFIXES = [suffix for model_format in FORMATS for suffix in model_format.suffixes]
 
 
 @pytest.mark.parametrize("name", ["a.ply", "b.PLY", "c.Ply"])
