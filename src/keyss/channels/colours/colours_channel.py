@@ -116,25 +116,21 @@ class ColoursCover:
         free[self.planner.writable] = True
         free[salt_rows] = False
         file_key = expand(secret, "colours/file-key", FILE_KEY_BYTES)
-        headers = self._headers(layouts, sizes, file_key, carriers, _without_places(free, secrets, carriers))
+        headers = self._headers(layouts, sizes, file_key, _without_places(free, secrets, carriers))
         for lower in range(_LOWER + 1):  # the plan does not include the cost of headers and salts
             lowered = [
                 replace(header, level=header.level and max(1, header.level - lower)) for header in headers
             ]
-            stego = self._write(secrets, lowered, layouts, contents, carriers, free, random)
+            stego = self._write(secrets, lowered, layouts, contents, free, random)
             if layouts[0].level == ONE or not self.planner.is_visible(stego):
                 break
         return stego
 
     def _headers(
-        self,
-        layouts: Sequence[Layout],
-        sizes: Sequence[int],
-        file_key: bytes,
-        carriers: Carriers,
-        holds: Flags,
+        self, layouts: Sequence[Layout], sizes: Sequence[int], file_key: bytes, holds: Flags
     ) -> list[Header]:
         """The header of each payload; `holds` [C]: mask of the carriers that may hold payloads."""
+        carriers = self.planner.carriers
         headers, first, middle = [], 0, round(median(carriers)) % 256
         for layout, size in zip(layouts, sizes, strict=True):
             last = min(first + max(1, math.ceil(SHARES * layout.share)), SHARES) - 1
@@ -152,7 +148,6 @@ class ColoursCover:
         headers: Sequence[Header],
         layouts: Sequence[Layout],
         payloads: Sequence[Payload],
-        carriers: Carriers,
         free: Flags,
         random: np.random.Generator,
     ) -> Gaussians:
@@ -161,6 +156,7 @@ class ColoursCover:
         `free` [C]: mask of carriers that may be written. Only likely values are written for payloads whose
         layout says so, and for their headers if these may skip values.
         """
+        carriers = self.planner.carriers
         free, values, chosen = free.copy(), carriers.colours[:, 1:].copy(), np.zeros(len(carriers), bool)
         for salt in range(SALTS):  # alternate between secrets, because later headers find fewer free places
             for index, secret in enumerate(secrets):
@@ -178,7 +174,7 @@ class ColoursCover:
             values[rows], chosen[rows] = write(key, ids, values[rows], bits, code), layout.likely
         new = self.planner.statistics.imitate(values)
         if chosen.any():
-            base = np.where(chosen[:, None], self.planner.carriers.colours, new)
+            base = np.where(chosen[:, None], carriers.colours, new)
             accepted = self.planner.likelihood.accept(base, new, random)
             new[:, 1:] = np.where(accepted, new[:, 1:], base[:, 1:])
         sh = self.cover.sh.detach().clone()
