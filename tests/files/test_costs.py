@@ -10,8 +10,10 @@ from dataclasses import replace
 import torch
 
 from files import hostile
+from files.formats.false_sizes import FALSE_SIZES
 from keyss.core import Camera
 from keyss.files.images import png_names
+from keyss.files.model_formats import FORMATS
 
 
 def test_hostile_files_stay_within_limits() -> None:
@@ -20,6 +22,13 @@ def test_hostile_files_stay_within_limits() -> None:
     costs = [hostile.Cost(**json.loads(line)) for line in output.splitlines()]
     assert [cost.name for cost in costs] == list(hostile.HOSTILE)
     assert not [cost for cost in costs if not cost.bounded]
+
+
+def test_every_format_has_hostile_files() -> None:
+    names = {f"a{suffix}" for model_format in FORMATS for suffix in model_format.suffixes}
+    files = {file for name in hostile.HOSTILE for file in hostile.HOSTILE[name](10_000)}
+    assert names - {"a.compressed.ply"} <= files
+    assert names - {"a.splat"} <= FALSE_SIZES.keys()  # which declares none
 
 
 def test_picture_names_take_linear_time() -> None:

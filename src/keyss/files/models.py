@@ -84,7 +84,7 @@ def reads_as(path: Path, model: Gaussians) -> bool:
 
     Raises InputError as `read_model` does.
     """
-    if type(model) is not Gaussians or not keeps_low_bits(path):
+    if type(model) is not Gaussians or _for_writing(path) is not PLY:
         return False
     with open_input(path) as file:
         return ply.holds(file, model)
@@ -92,8 +92,8 @@ def reads_as(path: Path, model: Gaussians) -> bool:
 
 def holds(path: Path | str, data: bytes, model: Gaussians) -> bool:
     """`reads_as` for a file at `path` that contains `data`."""
-    exact = type(model) is Gaussians and keeps_low_bits(path)
-    return exact and ply.holds(io.BytesIO(data), model)
+    is_plain_model = type(model) is Gaussians and _for_writing(path) is PLY
+    return is_plain_model and ply.holds(io.BytesIO(data), model)
 
 
 def model_of_bytes(path: Path | str, data: bytes) -> Gaussians:

@@ -133,7 +133,10 @@ def gaussians_of(
     colors: Numbers,  # [N, 3], f_dc
     rest: Numbers,  # [N, K - 1, 3], the other harmonics
 ) -> Gaussians:
-    """A model from arrays. Values that are not finite in single precision become infinite or NaN."""
+    """A model from arrays, with opacities in place of logits.
+
+    Values that are not finite in single precision become infinite or NaN.
+    """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         sh = np.empty((len(rest), 1 + rest.shape[1], 3), np.float32)
         sh[:, 0], sh[:, 1:] = colors, rest
@@ -203,7 +206,7 @@ def writable(model: Gaussians) -> Gaussians:
 
 
 def arrays_of(model: Gaussians) -> tuple[Floats, Doubles, Floats, Doubles, Floats, Floats]:
-    """The arguments of `gaussians_of` with unit quaternions, from a model on any device."""
+    """The arguments of `gaussians_of`, from a model on any device. Rounds: opacities, unit quaternions."""
     flat = model.detach().to("cpu")
     parts = (flat.means, flat.quats, flat.log_scales, flat.opacity_logits, flat.sh)
     means, quats, log_scales, opacity_logits, sh = (part.numpy() for part in parts)
