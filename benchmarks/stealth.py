@@ -89,8 +89,8 @@ def main() -> None:
         scenes, plain = {file.scene for file in files}, sum(file.kind == "plain" for file in files)
         print(f"{plain} plain models of {len(scenes)} scenes, {time.monotonic() - started:.0f} s\n")
         _print_detections(files, pieces, rows)
-        print("\n| confirmation | score | true above another |\n| --- | --- | --- |")
         if not options.quick:
+            print("\n| confirmation | score | true above another |\n| --- | --- | --- |")
             _print_confirmations(pool, files)
 
 
@@ -123,12 +123,16 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
 
 
 def _make(job: Job) -> list[File]:
-    """The plain model, and files that hide something."""
+    """The plain model, and files that hide something; nothing for a cover that hiding refuses."""
     cover = read_model(job.path)
     if job.rounded:
         cover = rounded(cover, job.index)
     made = [File("plain", job.scene, job.path, cover)]
-    capacity = CarryCapacity.of(LOW_BITS, cover, FitConfig())
+    try:
+        capacity = CarryCapacity.of(LOW_BITS, cover, FitConfig())
+    except UsageError as error:
+        print(f"{job.path} is left out: {error}", file=sys.stderr)
+        return []
     whole = read_model(job.secret)
     (secret,) = capacity.prune([whole], [Viewpoints.around(whole)])
     stego = carried.embed_derived(cover, [(keys(2 * job.index), secret)], os.urandom(32))

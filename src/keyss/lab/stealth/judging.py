@@ -19,6 +19,7 @@ from keyss.lab.stealth.statistic import BitPatterns, Statistic
 DETECTORS = (*low_bits.DETECTORS, *attributes.DETECTORS)
 _AGREEMENT = 0.03  # relative error assumed for a statistic without a known error
 _MANY = 1e7  # degrees of freedom: normal
+_BITS = f"{low_bits.bits.__name__}: "  # prefix of the statistics of single bits, whose variances agree
 
 
 @dataclass(frozen=True)
@@ -98,13 +99,13 @@ def compare_statistics(
     ratios = [
         _between(others) / _sampling(others)
         for name, others in samples.items()
-        if name.startswith("bits: ") and _sampling(others)
+        if name.startswith(_BITS) and _sampling(others)
     ]
     excess = max(1.0, float(np.mean(ratios))) if ratios else None
     rows = []
     for name, others in samples.items():
         values = [statistic.value for statistic in others]
-        p = _p(statistics[name], others, excess if name.startswith("bits: ") else None)
+        p = _p(statistics[name], others, excess if name.startswith(_BITS) else None)
         rows.append(
             JudgedStatistic(name, statistics[name].value, min(values), max(values), p, statistics[name].p)
         )

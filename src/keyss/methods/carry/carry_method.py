@@ -94,7 +94,7 @@ class CarryMethod:
             plan=plan,
             grows=capacity.channel.grows,
             survives=capacity.channel.survives,
-            carrier=capacity,
+            capacity=capacity,
         )
 
     def hide(self, sources: Sequence[Source], prepared: Prepared, context: Context) -> Stego:
@@ -104,7 +104,7 @@ class CarryMethod:
         checkpoint of another run.
         """
         cover, *secrets = sources
-        capacity: CarryCapacity = prepared.carrier
+        capacity: CarryCapacity = prepared.capacity
         assert capacity.prepared is not None  # the cover is fitted
         plain = [secret.model for secret in secrets]
         viewpoints = [Viewpoints.of(secret.scene) for secret in secrets]
