@@ -68,9 +68,14 @@ def audit(
 
     if dry_run:
         from keyss.lab.audits.audit_run import forecast_audit
+        from keyss.runs.estimates import seconds_for
+        from keyss.runs.files import stego_in
 
-        seconds = forecast_audit(run, controls=controls, only=only, device=device)
-        print_table(("part", "time, about"), [(name, progress.about(each)) for name, each in seconds.items()])
+        with progress.waiting("reading the scenes", seconds_for("prepare", stego_in(run))):
+            seconds = forecast_audit(run, controls=controls, only=only, device=device)
+        print_table(
+            ("part", "time, about"), [(name, progress.about(duration)) for name, duration in seconds.items()]
+        )
         print(f"About {progress.about(sum(seconds.values()))}; controls that exist take no time.")
         print("Dry run: nothing was written. Times are rough.")
         return

@@ -36,7 +36,7 @@ from keyss.rendering.orbit import Viewpoints
 # Fine-tuning to renders starts near the optimum: maximum steps, and factor on the rates.
 _MODEL_ITERATIONS, _MODEL_RATE = 400, 0.1
 _SELECTION_VIEWS = 64
-_FINE_TUNED_SHARE = 0.97  # Gaussians after fine-tuning / that fit: they compress a little worse then
+_FINE_TUNED_SHARE = 0.97  # of the Gaussians that fit are kept, since fine-tuned ones compress a little worse
 _MIN_SHARE = 1 / 6  # of a secret's Gaussians; public models fine-tuned with fewer are below 30 dB
 
 
@@ -94,7 +94,7 @@ class CarryMethod:
             plan=plan,
             grows=capacity.channel.grows,
             survives=capacity.channel.survives,
-            carrier=capacity,
+            capacity=capacity,
         )
 
     def hide(self, sources: list[Source], prepared: Prepared, context: Context) -> Stego:
@@ -105,7 +105,7 @@ class CarryMethod:
         """
         cover, *secrets = sources
         sources.clear()
-        capacity: CarryCapacity = prepared.carrier
+        capacity: CarryCapacity = prepared.capacity
         assert capacity.prepared is not None  # the cover is fitted
         keys = [secret.key for secret in secrets]
         viewpoints = [Viewpoints.of(secret.scene) for secret in secrets]
