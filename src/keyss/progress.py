@@ -119,7 +119,10 @@ class ProgressLines(Reporter):
 
     @contextmanager
     def waiting(self, what: str, seconds: float) -> Iterator[Share]:
-        """See `Reporter`. A terminal displays a moving sign; logs get a line every 10 s, the first of long waits after 2 s."""
+        """See `Reporter`. A terminal displays a moving sign; logs get a line every 10 s.
+
+        The first line of a long wait is logged after 2 s.
+        """
         wait = Wait(what, seconds * _crowding(), self.timer)
         if self.live:
             with self.console.status(wait, refresh_per_second=4):

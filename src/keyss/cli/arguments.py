@@ -43,8 +43,9 @@ KeyFilesToCheck = Annotated[
 Preset = Annotated[
     Literal["quick", "default", "full"],
     arg(
-        help="Training steps and maximum number of Gaussians of each model: quick 500 and 10k; default 1k and "
-        "30k, on CUDA as full; full 30k and 500k, on CUDA 1M."  # the parser breaks lines at any comma
+        # The parser breaks lines at any comma.
+        help="Training steps and maximum number of Gaussians of each model: quick 500 and 10k; default 1k "
+        "and 30k, on CUDA as full; full 30k and 500k, on CUDA 1M."
     ),
 ]
 Width = Annotated[int | None, optional("PIXELS", "Downscale wider photos to this width.")]

@@ -63,7 +63,8 @@ def print_hiding(metrics: HideMetrics, *, brief: bool = False) -> None:
     table = [[name, *(row.get(head, "") for head in heads)] for name, row in zip(first, rows, strict=True)]
     print_table([views, *heads], table)
     legend = "; ".join(text for head in heads if (text := _HEADS[head]))
-    lines = [f"{legend}.", *_lines_on_wrong_keys(metrics, names) * (not brief), *_lines_on_files(metrics, names)]
+    wrong_keys = [] if brief else _lines_on_wrong_keys(metrics, names)
+    lines = [f"{legend}.", *wrong_keys, *_lines_on_files(metrics, names)]
     if not brief:
         units = {"capacity": "Gaussians", "capacity_bytes": "bytes"}
         capacities = {unit: metrics.details[name] for name, unit in units.items() if name in metrics.details}
@@ -107,11 +108,14 @@ def _quality(of: ImageQuality) -> dict[str, str]:
 def print_plan(method: str, plan: Plan, cost: Cost) -> None:
     """Print capacity and estimates of a run."""
     steps = f", {cost.steps:,} training steps" if cost.steps else ""
-    pruned = plan.capacity < plan.secret_gaussians
+    rough = "about " if plan.capacity < plan.secret_gaussians else ""
     _print_columns(
         [
             ("method", method),
-            ("capacity", f"room for {'about ' * pruned}{plan.capacity:,} of the {plan.secret_gaussians:,} Gaussians to hide"),
+            (
+                "capacity",
+                f"room for {rough}{plan.capacity:,} of the {plan.secret_gaussians:,} Gaussians to hide",
+            ),
             (
                 "published",
                 f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, {plan.megabytes:,.1f} MB",

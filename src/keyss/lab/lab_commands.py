@@ -180,9 +180,7 @@ def reproduce(
     *,
     full: Annotated[
         bool,
-        switch(
-            "The scenes are the paper's: its pairs, 30k steps and 500k Gaussians, photos as they are."
-        ),
+        switch("The scenes are the paper's: its pairs, 30k steps and 500k Gaussians, photos as they are."),
     ] = False,
     pairs: Annotated[
         UseAppendAction[tuple[str, ...]],
