@@ -127,8 +127,8 @@ def _table(records: Sequence[Mapping[str, Any]]) -> str:
         "| model | Gaussians | payloads | bytes | bits per Gaussian | cost, dB: mean (least) |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
-    for name in dict.fromkeys(each["model"] for each in records):
-        own = [each for each in records if each["model"] == name]
+    for name in dict.fromkeys(record["model"] for record in records):
+        own = [record for record in records if record["model"] == name]
         size, gaussians = own[0]["bytes"], own[0]["gaussians"]
         costs = [each["cost"] for each in own]
         lines.append(
@@ -136,8 +136,8 @@ def _table(records: Sequence[Mapping[str, Any]]) -> str:
             f"| {np.mean(costs):.1f} ({min(costs):.1f}) |"
         )
     tries, failures = Counter[str](), Counter[str]()
-    for each in records:
-        for what, good in each["opened"].items():
+    for record in records:
+        for what, good in record["opened"].items():
             tries[what] += 1
             failures[what] += not good
     lines += ["", "| format | openings | failures | rate below, with 95 % |", "| --- | --- | --- | --- |"]
@@ -229,7 +229,9 @@ def _chain(first: Change, second: Change) -> Change:
 OWN: dict[str, Change] = {
     f"`{suffix}` by keyss": _convert_by_keyss(suffix) for each in FILE_FORMATS for suffix in each.suffixes
 }
-_BY_TOOL: dict[str, Change] = {f"{each.format} by {each.tool}": each for each in lab.converters()}
+_BY_TOOL: dict[str, Change] = {
+    f"{converter.format} by {converter.tool}": converter for converter in lab.converters()
+}
 FORMATS: dict[str, Change] = {"raw `.ply`": lambda model: model, **_BY_TOOL}
 OTHERS: dict[str, Change] = {
     "reordered": _shuffle,

@@ -43,8 +43,8 @@ class Capacity:
         overhead: int, shares: Sequence[tuple[float, int]], equal: Callable[[int], int], grows: bool = False
     ) -> Capacity:
         """The capacity for data, from that for sealed payloads: they take up to `overhead` bytes more."""
-        own = tuple((part, max(0, size - overhead)) for part, size in shares)
-        return Capacity(own, lambda count: max(0, equal(count) - overhead), grows)
+        payload_shares = tuple((part, max(0, size - overhead)) for part, size in shares)
+        return Capacity(payload_shares, lambda count: max(0, equal(count) - overhead), grows)
 
     @property
     def bytes(self) -> int:

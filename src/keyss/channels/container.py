@@ -31,7 +31,7 @@ import numpy as np
 
 from keyss.channels.reed_solomon import Codewords
 from keyss.core.arrays import Bytes, Integers
-from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError
+from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError, of_other_version
 from keyss.keys.derivation import DerivedKey, expand, stream
 from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
 
@@ -147,7 +147,7 @@ class Parameters:
             return None
         version, *fields = _PARAMETERS.unpack_from(packed, _CHECK_BYTES)
         if version != _VERSION:
-            raise InputError(f"hidden secret of version {version}; this program reads version {_VERSION}")
+            raise InputError(of_other_version(version, _VERSION))
         return Parameters(*fields)
 
 

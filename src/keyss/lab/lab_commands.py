@@ -70,7 +70,9 @@ def audit(
         from keyss.lab.audits.audit_run import forecast_audit
 
         seconds = forecast_audit(run, controls=controls, only=only, device=device)
-        print_table(("part", "time, about"), [(name, progress.about(each)) for name, each in seconds.items()])
+        print_table(
+            ("part", "time, about"), [(name, progress.about(duration)) for name, duration in seconds.items()]
+        )
         print(f"About {progress.about(sum(seconds.values()))}; controls that exist take no time.")
         print("Dry run: nothing was written. Times are rough.")
         return

@@ -90,7 +90,7 @@ def test_failed_trials(
     monkeypatch.setattr(trial, "hide", failing)
     found = run("speed", folders, out)
     assert found.failures == {f"{name}, a-b": "not today" for name in ("3DGS", "GS-Hider", "WaterGS")}
-    verdicts = [each.verdict for each in found.claims]
+    verdicts = [claim.verdict for claim in found.claims]
     assert verdicts[0] in ("holds", "holds in part", "does not hold here")  # from the first run
     assert verdicts[1] == "not measured"
     said = keyss("reproduce", "speed", *folders, *FLAGS, "-o", out)

@@ -39,7 +39,7 @@ _SELECTION_VIEWS = 64
 _FINE_TUNED_SHARE = 0.97  # Gaussians after fine-tuning / that fit: they compress a little worse then
 # Least shares of a secret's Gaussians. Public models fine-tuned with fewer are below 30 dB; with fewer than
 # the second, and than so many Gaussians, below 20 dB or as far from the plain model as empty renders.
-_MIN_SHARE, _HOPELESS_SHARE, _HOPELESS = 1 / 6, 1 / 50, 500
+_MIN_SHARE, _HOPELESS_SHARE, _HOPELESS = 1 / 6, 1 / 100, 500
 
 
 class CarryMethod:
@@ -106,7 +106,7 @@ class CarryMethod:
             plan=plan,
             grows=capacity.channel.grows,
             survives=capacity.channel.survives,
-            carrier=capacity,
+            capacity=capacity,
         )
 
     def hide(self, sources: Sequence[Source], prepared: Prepared, context: Context) -> Stego:
@@ -116,7 +116,7 @@ class CarryMethod:
         checkpoint of another run.
         """
         cover, *secrets = sources
-        capacity: CarryCapacity = prepared.carrier
+        capacity: CarryCapacity = prepared.capacity
         assert capacity.prepared is not None  # the cover is fitted
         plain = [secret.model for secret in secrets]
         viewpoints = [Viewpoints.of(secret.scene) for secret in secrets]
