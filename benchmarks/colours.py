@@ -32,7 +32,7 @@ from typing import Any
 from keyss import lab
 from keyss.channels import COLOURS, ColoursCover, ColoursReader, Payload
 from keyss.core import BackendError, Gaussians, InputError, Similarity, WrongKeyError
-from keyss.files import FORMATS as FILE_FORMATS, read_model, write_model
+from keyss.files import FORMATS, read_model, write_model
 from keyss.rendering import psnr_between
 
 import numpy as np
@@ -73,7 +73,7 @@ def main() -> None:
         path = asked.models[number % len(asked.models)]
         if path not in prepared:
             prepared[path] = COLOURS.prepare(sampled(read_model(path), asked.gaussians))
-        ways = OWN | (FORMATS if number % asked.foreign_each == 0 else {})
+        ways = OWN | (CONVERSIONS if number % asked.foreign_each == 0 else {})
         ways = {what: change for what, change in ways.items() if asked.only in what}
         found = _try_payload(prepared[path], number, asked.size, ways, OTHERS if asked.changes else {})
         records.append({"number": number, "model": path.stem, **found})
@@ -153,7 +153,7 @@ def _bound(failures: int, count: int) -> float:
 
 
 def _write_pairs(models: Sequence[Path], folder: Path, shares: Sequence[float], only: str) -> None:
-    wanted = {what: change for what, change in FORMATS.items() if only in what}
+    wanted = {what: change for what, change in CONVERSIONS.items() if only in what}
     lines: dict[str, list[str]] = {}
     for number, path in enumerate(models):
         scene, prepared = path.stem.rsplit("-", 1)[0], COLOURS.prepare(read_model(path))
@@ -227,12 +227,12 @@ def _chain(first: Change, second: Change) -> Change:
 
 
 OWN: dict[str, Change] = {
-    f"`{suffix}` by keyss": _convert_by_keyss(suffix) for each in FILE_FORMATS for suffix in each.suffixes
+    f"`{suffix}` by keyss": _convert_by_keyss(suffix) for each in FORMATS for suffix in each.suffixes
 }
 _BY_TOOL: dict[str, Change] = {
     f"{converter.format} by {converter.tool}": converter for converter in lab.converters()
 }
-FORMATS: dict[str, Change] = {"raw `.ply`": lambda model: model, **_BY_TOOL}
+CONVERSIONS: dict[str, Change] = {"raw `.ply`": lambda model: model, **_BY_TOOL}
 OTHERS: dict[str, Change] = {
     "reordered": _shuffle,
     "cropped to a half": lab.cropping(1),

@@ -37,7 +37,7 @@ from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
 
 METHOD_BYTES = 15  # maximum length of a method's name
 MAX_OVERHEAD = OVERHEAD + METHOD_BYTES + 1  # bytes of a sealed payload beside its data and record, at most
-SALTS_TRIED = 4  # with half of the Gaussians changed, 15 of 16 models still open
+SALTS_TRIED = 4  # if half of the Gaussians changed, all four salts did in one of 16 models
 _NOT_INDEPENDENT = (
     "the secrets are too large, or too many, to be placed independently of each other: whoever holds one of "
     "the keys can notice that there are other secrets"

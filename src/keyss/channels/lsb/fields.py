@@ -41,7 +41,7 @@ ROTATIONS: dict[type[Codes], tuple[int, int]] = {
     SogCodes: (0, 255),
     CompressedPlyCodes: (0, 1023),
 }
-FORMATS = {rotation.name: rotation for rotation in ROTATIONS}
+QUANTISED = {rotation.name: rotation for rotation in ROTATIONS}
 MAX_BITS = 10
 _POSITION_RANGE = -3.0  # log2 of the range of written positions, in sizes of the Gaussian
 LOG_SCALE_RANGE = -4.0  # log2 of the range of written log scales

@@ -22,7 +22,7 @@ from keyss.channels.container import Payload, SaltedReader
 from keyss.channels.lsb import wet_paper
 from keyss.channels.lsb.decoded import Decoded
 from keyss.channels.lsb.fields import (
-    FORMATS,
+    QUANTISED,
     Field,
     Levels,
     file_order,
@@ -66,7 +66,7 @@ class QuantisedChannel(Channel):
         With `decoded`, the cover is its model, perhaps with fewer harmonics.
         """
         if self.decoded is None:
-            return QuantisedCover.of(FORMATS[self.format].of(cover))
+            return QuantisedCover.of(QUANTISED[self.format].of(cover))
         return QuantisedCover.of(self.decoded.codes, replace(self.decoded, model=cover.detach().to("cpu")))
 
     def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:

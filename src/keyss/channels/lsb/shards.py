@@ -9,11 +9,11 @@ of one Gaussian at the least depth. Each fragment has several places, the Gaussi
 values among those that the function assigns to it. Some of these cannot be written, are taken or lost. A
 reader looks at eight times as many, because others may have been added: the most frequent content counts.
 
-*Shards* of a payload fill all Gaussians of a secret's share. The function assigns each Gaussian to a group of
-codewords, and masks the number that a shard has in its group. In rows of 5 bytes and more, a tag of one byte
-precedes it: of other Gaussians one in 256 has the right one by chance; in smaller rows, one in 64 has the
-number of a shard. Such false shards contradict true ones, which are lost thereby, or are errors, which the
-code corrects.
+*Shards* of a payload fill all Gaussians of a secret's share. The function assigns each Gaussian to a group
+of codewords, and masks the number that a shard has in its group. Rows of 5 bytes and more begin with a tag of
+one byte, which one in 256 of the other Gaussians has by chance. Smaller rows have none; there, one in 64 has
+a valid number by chance. Such false shards either contradict a true one, so that both are lost, or are
+errors, which the code corrects.
 """
 
 from __future__ import annotations
