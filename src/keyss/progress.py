@@ -15,7 +15,8 @@ from rich.text import Text
 
 level = 0  # -1: silent, 1: more often; set by the command line
 _DELAY_SECONDS = 1.0  # before a terminal displays a wait
-_QUIET_SECONDS, _WAIT_SECONDS = 2.0, 10.0  # in logs: before the first line of a wait, and between lines
+# In logs: before the first line of a long wait; between lines, and before the first line of a short wait.
+_QUIET_SECONDS, _WAIT_SECONDS = 2.0, 10.0
 _PRIOR = 0.1  # weight of an estimated time in the pace of a wait, relative to all of its work
 
 Share = Callable[[float], None]  # called with the share of the work that is done
@@ -119,7 +120,10 @@ class ProgressLines(Reporter):
 
     @contextmanager
     def waiting(self, what: str, seconds: float) -> Iterator[Share]:
-        """See `Reporter`. Displayed in terminals after 1 s; in logs, a line after 2 s and then every 10 s."""
+        """See `Reporter`. A terminal displays a moving sign after 1 s; logs get a line every 10 s.
+
+        The first line of a long wait is logged after 2 s.
+        """
         wait = Wait(what, seconds * _crowding(), self.timer)
         ended = threading.Event()
 
@@ -129,7 +133,7 @@ class ProgressLines(Reporter):
                     with self.console.status(wait, refresh_per_second=4):
                         ended.wait()
                 return
-            pause = _QUIET_SECONDS
+            pause = _QUIET_SECONDS if wait.seconds > _WAIT_SECONDS else _WAIT_SECONDS
             while not ended.wait(pause):
                 self.note(str(wait))
                 pause = max(_WAIT_SECONDS, self.every)
