@@ -152,9 +152,10 @@ class Shards:
         fits = local < self.in_group
         if self.tagged:
             fits &= low[:, 0] == tags
-        start = at + _NUMBER_BYTES
-        data = function(self.data_key, "shard/pad", ids[fits], self.codewords.width)
-        data ^= low[fits, start : start + self.codewords.width]
+        rows, left = np.flatnonzero(fits), low[:, at + _NUMBER_BYTES :]
+        data = function(self.data_key, "shard/pad", ids[rows], self.codewords.width)
+        for start in range(0, len(rows), _ROWS):  # a copy of all takes memory
+            data[start : start + _ROWS] ^= left[rows[start : start + _ROWS], : self.codewords.width]
         return fits, self._number(group[fits], local[fits].astype(np.int64)), data
 
     @property
