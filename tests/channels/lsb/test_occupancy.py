@@ -15,7 +15,7 @@ from keyss.channels import LEAST, Layout, LowBitsCapacity, Parameters, Payload, 
 from keyss.channels.container import key_secret
 from keyss.channels.lsb.low_bits import Writer
 from keyss.channels.lsb.low_bits_capacity import codewords_of, key_message, parameter_message
-from keyss.channels.lsb.usable import SALTS
+from keyss.channels.lsb.salts import SALTS
 from keyss.core import KeyssWarning
 
 CARRIERS, LAYOUT = 4000, Layout(3)
