@@ -28,7 +28,7 @@ from keyss.files.formats.common import morton_order
 from keyss.kernels.jit import inline, kernel
 from keyss.kernels.parallel import in_blocks
 
-_NEIGHBOURS = 12  # siblings were among the nearest 10 in models of 20,000 to 200,000 Gaussians
+_NEIGHBOURS = 8  # most siblings; detectors that look at 12 find no more than with 12 here
 _EQUAL = 3  # numbers
 _ALIKE, _FURTHER = 2, 1 << 8  # pairs of a Gaussian by sums of three harmonics, and how many are looked at
 _ROWS = 1 << 11  # that a thread takes at a time
@@ -73,9 +73,7 @@ class Steps:
         apart = np.zeros(len(self.order), bool)
 
         def mark(start: int, stop: int) -> None:
-            own = rows[start:stop]
-            for pairs in (_with(own, _COLOURS), _with(own, _ZERO), self._neighbours(own)):
-                _mark(pairs, *self.words, depth, apart)
+            _mark(self._pairs(rows[start:stop], _COLOURS, _ZERO), *self.words, depth, apart)
 
         in_blocks(mark, len(rows), _ROWS, _mark)
         _mark(alike, *self.words, depth, apart)
@@ -91,7 +89,8 @@ class Steps:
 
         rows, random, chances = self.order[usable[self.order]], np.random.default_rng(0), [1.0]
         rows = rows[:: max(1, len(rows) // _SAMPLE)]
-        pairs = np.concatenate([_with(rows, _COLOURS), self._neighbours(rows)])
+        pairs = self._pairs(rows, _COLOURS)
+        pairs = pairs[(pairs[:, 1] < 0) | (pairs[:, 0] < pairs[:, 1])]  # each counts once
         found, count = np.empty((0, 7), np.uint32), 0
         while count == len(found):
             found = np.empty((2 * len(found) + len(rows) + 1, 7), np.uint32)
@@ -105,18 +104,18 @@ class Steps:
             chances += pdtrc(hits - 1.0, np.maximum(drawn, 1) / _DRAWS)[hits > 0].tolist()
         return min(1.0, min(chances) * len(_KINDS) * len(_PARTS))
 
-    def _neighbours(self, rows: Integers) -> Integers:
-        """[P, 2] pairs of `rows` [R] and their nearest neighbours; mutual ones once."""
-        near = self.near[rows]
-        again = (near < rows[:, None]) & (self.near[near] == rows[:, None, None]).any(axis=2)
-        at, place = np.nonzero(~again)
-        return np.stack([rows[at], near[at, place]], axis=1)
+    def _pairs(self, rows: Integers, *others: int) -> Integers:
+        """[P, 2] pairs of `rows` [R] with `others` and with their nearest neighbours."""
+        every = [np.full((len(rows), 1), other) for other in others] + [self.near[rows]]
+        beside = np.concatenate(every, axis=1)
+        return np.stack([rows.repeat(beside.shape[1]), beside.ravel()], axis=1)
 
 
 def moved_from_zero(gaussians: Gaussians, layout: Layout) -> Flags:
     """Mask [N] of Gaussians whose numbers moved by equal amounts away from zero, at the least depth."""
     apart = np.zeros(len(gaussians), bool)
-    _mark(_with(np.arange(len(apart)), _ZERO), *_words(gaussians, layout), LEAST, apart)
+    pairs = np.stack([np.arange(len(apart)), np.full(len(apart), _ZERO)], axis=1)
+    _mark(pairs, *_words(gaussians, layout), LEAST, apart)
     return apart
 
 
@@ -126,11 +125,6 @@ def redrawn(words: Words32, chosen: Flags, depth: int, random: np.random.Generat
     drawn = random.integers(0, 1 << depth, words[chosen].shape, np.uint32) << np.uint32(1)
     new[chosen] = new[chosen] & ~mask | drawn
     return new
-
-
-def _with(rows: Integers, other: int) -> Integers:
-    """[R, 2] pairs of `rows` [R] and `other`."""
-    return np.stack([rows, np.full_like(rows, other)], axis=1)
 
 
 def _words(gaussians: Gaussians, layout: Layout) -> tuple[Words32, Words32]:
