@@ -93,8 +93,8 @@ def files(folder: Path, format_name: str, models: list[str]) -> None:
     """Write pairs of files, and the file `pairs` with the arguments of benchmarks/stealth.py."""
     folder.mkdir(parents=True, exist_ok=True)
     found = []
-    for each in models:
-        scene, _, path = each.partition("=")
+    for model in models:
+        scene, _, path = model.partition("=")
         cover = QuantisedChannel(format_name).prepare(read_model(path))
         plain, stego = (
             folder / f"{Path(path).stem}-{kind}{SUFFIXES[format_name]}" for kind in ("plain", "stego")

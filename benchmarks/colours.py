@@ -32,7 +32,7 @@ from typing import Any
 from keyss import lab
 from keyss.channels import COLOURS, ColoursCover, ColoursReader, Payload
 from keyss.core import BackendError, Gaussians, InputError, Similarity, WrongKeyError
-from keyss.files import FORMATS as FILE_FORMATS, read_model, write_model
+from keyss.files import FORMATS, read_model, write_model
 from keyss.rendering import psnr_between
 
 import numpy as np
@@ -73,7 +73,7 @@ def main() -> None:
         path = asked.models[number % len(asked.models)]
         if path not in prepared:
             prepared[path] = COLOURS.prepare(sampled(read_model(path), asked.gaussians))
-        ways = OWN | (FORMATS if number % asked.foreign_each == 0 else {})
+        ways = OWN | (CONVERSIONS if number % asked.foreign_each == 0 else {})
         ways = {what: change for what, change in ways.items() if asked.only in what}
         found = _try_payload(prepared[path], number, asked.size, ways, OTHERS if asked.changes else {})
         records.append({"number": number, "model": path.stem, **found})
@@ -127,8 +127,8 @@ def _table(records: Sequence[Mapping[str, Any]]) -> str:
         "| model | Gaussians | payloads | bytes | bits per Gaussian | cost, dB: mean (least) |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
-    for name in dict.fromkeys(each["model"] for each in records):
-        own = [each for each in records if each["model"] == name]
+    for name in dict.fromkeys(record["model"] for record in records):
+        own = [record for record in records if record["model"] == name]
         size, gaussians = own[0]["bytes"], own[0]["gaussians"]
         costs = [each["cost"] for each in own]
         lines.append(
@@ -136,8 +136,8 @@ def _table(records: Sequence[Mapping[str, Any]]) -> str:
             f"| {np.mean(costs):.1f} ({min(costs):.1f}) |"
         )
     tries, failures = Counter[str](), Counter[str]()
-    for each in records:
-        for what, good in each["opened"].items():
+    for record in records:
+        for what, good in record["opened"].items():
             tries[what] += 1
             failures[what] += not good
     lines += ["", "| format | openings | failures | rate below, with 95 % |", "| --- | --- | --- | --- |"]
@@ -153,7 +153,7 @@ def _bound(failures: int, count: int) -> float:
 
 
 def _write_pairs(models: Sequence[Path], folder: Path, shares: Sequence[float], only: str) -> None:
-    wanted = {what: change for what, change in FORMATS.items() if only in what}
+    wanted = {what: change for what, change in CONVERSIONS.items() if only in what}
     lines: dict[str, list[str]] = {}
     for number, path in enumerate(models):
         scene, prepared = path.stem.rsplit("-", 1)[0], COLOURS.prepare(read_model(path))
@@ -227,10 +227,12 @@ def _chain(first: Change, second: Change) -> Change:
 
 
 OWN: dict[str, Change] = {
-    f"`{suffix}` by keyss": _convert_by_keyss(suffix) for each in FILE_FORMATS for suffix in each.suffixes
+    f"`{suffix}` by keyss": _convert_by_keyss(suffix) for each in FORMATS for suffix in each.suffixes
 }
-_BY_TOOL: dict[str, Change] = {f"{each.format} by {each.tool}": each for each in lab.converters()}
-FORMATS: dict[str, Change] = {"raw `.ply`": lambda model: model, **_BY_TOOL}
+_BY_TOOL: dict[str, Change] = {
+    f"{converter.format} by {converter.tool}": converter for converter in lab.converters()
+}
+CONVERSIONS: dict[str, Change] = {"raw `.ply`": lambda model: model, **_BY_TOOL}
 OTHERS: dict[str, Change] = {
     "reordered": _shuffle,
     "cropped to a half": lab.cropping(1),

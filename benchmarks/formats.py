@@ -106,7 +106,7 @@ def changes(before: Gaussians, after: Gaussians) -> list[tuple[float, float]]:
     differences: list[Tensor | None] = [b.means - a.means, b.log_scales - a.log_scales, angles]
     differences += [b.opacities - a.opacities, b.sh[:, 0] - a.sh[:, 0]]
     differences += [None, None] if higher is None else [higher[:, 1:4], higher[:, 4:]]
-    return [_spread(each) for each in differences]
+    return [_spread(difference) for difference in differences]
 
 
 def _nearest(before: Gaussians, after: Gaussians) -> np.ndarray:

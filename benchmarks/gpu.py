@@ -238,9 +238,9 @@ def draw(name: str, options: argparse.Namespace, *models: Gaussians) -> None:
         with torch.no_grad():
             image = render(model.to(options.device), view.camera, scene.background.to(options.device))
         parts += [(image.clamp(0, 1).cpu() * 255).round().byte(), view.image]
-    pictures = [Image.fromarray(each.numpy()) for each in parts]
-    pictures = [each.resize((each.width * HEIGHT // each.height, HEIGHT)) for each in pictures]
-    row = Image.new("RGB", (sum(each.width for each in pictures), HEIGHT))
+    pictures = [Image.fromarray(part.numpy()) for part in parts]
+    pictures = [picture.resize((picture.width * HEIGHT // picture.height, HEIGHT)) for picture in pictures]
+    row = Image.new("RGB", (sum(picture.width for picture in pictures), HEIGHT))
     for index, each in enumerate(pictures):
         row.paste(each, (sum(before.width for before in pictures[:index]), 0))
     row.save(options.results / f"{name}.jpg", quality=85)

@@ -102,7 +102,7 @@ class Clock:
 
 def leaves_of(model: Gaussians) -> list[Tensor]:
     tensors = (model.means, model.quats, model.scales, model.opacities, model.sh)
-    return [each.detach().requires_grad_() for each in tensors]
+    return [tensor.detach().requires_grad_() for tensor in tensors]
 
 
 def draw(leaves: list[Tensor], camera: Camera, sh_degree: int) -> Tensor:

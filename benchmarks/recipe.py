@@ -84,7 +84,7 @@ def by_seed(rows: list[dict[str, Any]]) -> None:
     means = [(mean(row["gain"] for row in own), own[0]["scene"]) for own in every]
     print(f"lowest mean of a scene: {min(means)[0]:+.2f} dB ({min(means)[1]})")
     pairs = [b["3dgs"] - a["3dgs"] for own in every for a, b in permutations(own, 2)]
-    below, ours = sum(each < -1 for each in pairs), sum(row["gain"] < -1 for row in rows)
+    below, ours = sum(pair < -1 for pair in pairs), sum(row["gain"] < -1 for row in rows)
     print(f"more than 1 dB below: {ours} of {len(rows)}; 3DGS's with another seed {below} of {len(pairs)}")
 
 
@@ -103,7 +103,7 @@ def fit_and_score(scene: Scene, config: FitConfig) -> tuple[float, float]:
 def scenes(data: Path, width: int) -> dict[str, Callable[[], Scene]]:
     """Functions that load each scene, by name."""
     found: dict[str, Callable[[], Scene]] = {}
-    for folder in sorted(each for each in data.iterdir() if each.is_dir()):
+    for folder in sorted(path for path in data.iterdir() if path.is_dir()):
         if any((folder / name).exists() for name in ("sparse", "transforms_train.json", "transforms.json")):
             for name, change in VARIANTS.items():
                 found[f"{folder.name}, {name}"] = lambda folder=folder, change=change: change(

@@ -89,8 +89,8 @@ def main() -> None:
         scenes, plain = {file.scene for file in files}, sum(file.kind == "plain" for file in files)
         print(f"{plain} plain models of {len(scenes)} scenes, {time.monotonic() - started:.0f} s\n")
         _print_detections(files, pieces, rows)
-        print("\n| confirmation | score | true above another |\n| --- | --- | --- |")
         if not options.quick:
+            print("\n| confirmation | score | true above another |\n| --- | --- | --- |")
             _print_confirmations(pool, files)
 
 
@@ -123,12 +123,16 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
 
 
 def _make(job: Job) -> list[File]:
-    """The plain model, and files that hide something."""
+    """The plain model, and files that hide something; nothing for a cover that hiding refuses."""
     cover = read_model(job.path)
     if job.rounded:
         cover = rounded(cover, job.index)
     made = [File("plain", job.scene, job.path, cover)]
-    capacity = CarryCapacity.of(LOW_BITS, cover, FitConfig())
+    try:
+        capacity = CarryCapacity.of(LOW_BITS, cover, FitConfig())
+    except UsageError as error:
+        print(f"{job.path} is left out: {error}", file=sys.stderr)
+        return []
     whole = read_model(job.secret)
     (secret,) = capacity.prune([whole], [Viewpoints.around(whole)])
     stego = carried.embed_derived(cover, [(keys(2 * job.index), secret)], os.urandom(32))
@@ -203,9 +207,9 @@ def _print_confirmations(pool: ProcessPoolExecutor, files: Sequence[File]) -> No
         scores = list(pool.map(candidate_scores, *zip(*cases, strict=True), chunksize=4))
         true = [paths.index(file.secret) for file in own]
         found = {
-            name: confirmed(np.array([each[name] for each in scores]).reshape(len(own), len(paths)), true)
+            name: confirmed(np.array([score[name] for score in scores]).reshape(len(own), len(paths)), true)
             for name in scores[0]
-            if all(name in each for each in scores)
+            if all(name in score for score in scores)
         }
         for name, value in sorted(found.items(), key=lambda pair: -abs(pair[1] - 0.5)):
             print(f"| {kind}, {len(own)} files, {len(paths)} candidates | {name} | {value:.3f} |")

@@ -106,6 +106,7 @@ def test_time_left_follows_the_pace_of_the_work(timer: Timer) -> None:
 
 def test_long_waits_are_logged(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("keyss.progress._QUIET_SECONDS", 0.05)
+    monkeypatch.setattr("keyss.progress._crowding", lambda: 1.0)
     log = console(False)
     with ProgressLines(log).waiting("checking a.ply", 100):
         for _ in range(200):
@@ -117,6 +118,8 @@ def test_long_waits_are_logged(monkeypatch: pytest.MonkeyPatch) -> None:
     before = text(log)
     with ProgressLines(log).waiting("nothing to do", 100):
         pass
+    with ProgressLines(log).waiting("reading a.ply", 2):
+        time.sleep(0.2)
     assert text(log) == before
 
 

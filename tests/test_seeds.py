@@ -80,9 +80,9 @@ def test_salts_differ_for_equal_seeds(options: MethodOptions) -> None:
     common = salts[0] & salts[1]
     for own, stego in zip(salts, stegos, strict=True):
         readers = [each for each in (LowBitsReader.of(stego), AppendedReader.of(stego)) if each]
-        assert common <= {salt for each in readers for salt in each.salts}
-        assert not any(_opens(each, salt) for each in readers for salt in common)
-        assert any(_opens(each, salt) for each in readers for salt in own)
+        assert common <= {salt for reader in readers for salt in reader.salts}
+        assert not any(_opens(reader, salt) for reader in readers for salt in common)
+        assert any(_opens(reader, salt) for reader in readers for salt in own)
 
 
 def _opens(reader: LowBitsReader | AppendedReader, salt: bytes) -> bool:

@@ -14,7 +14,8 @@ from rich.table import Column
 from rich.text import Text
 
 level = 0  # -1: silent, 1: more often; set by the command line
-_QUIET_SECONDS, _WAIT_SECONDS = 2.0, 10.0  # in logs: before the first line of a wait, and between lines
+# In logs: before the first line of a long wait; between lines, and before the first line of a short wait.
+_QUIET_SECONDS, _WAIT_SECONDS = 2.0, 10.0
 _PRIOR = 0.1  # weight of an estimated time in the pace of a wait, relative to all of its work
 
 Share = Callable[[float], None]  # called with the share of the work that is done
@@ -118,7 +119,10 @@ class ProgressLines(Reporter):
 
     @contextmanager
     def waiting(self, what: str, seconds: float) -> Iterator[Share]:
-        """See `Reporter`. A terminal displays a moving sign; logs get a line after 2 s, then every 10 s."""
+        """See `Reporter`. A terminal displays a moving sign; logs get a line every 10 s.
+
+        The first line of a long wait is logged after 2 s.
+        """
         wait = Wait(what, seconds * _crowding(), self.timer)
         if self.live:
             with self.console.status(wait, refresh_per_second=4):
@@ -127,7 +131,7 @@ class ProgressLines(Reporter):
         ended = threading.Event()
 
         def log() -> None:
-            pause = _QUIET_SECONDS
+            pause = _QUIET_SECONDS if wait.seconds > _WAIT_SECONDS else _WAIT_SECONDS
             while not ended.wait(pause):
                 self.note(str(wait))
                 pause = max(_WAIT_SECONDS, self.every)

@@ -36,7 +36,7 @@ def points() -> list[int]:
 @pytest.mark.parametrize(("k", "n"), [(1, 2), (2, 3), (10, 20), (60, 90), (7, 255), (5, 513)])
 def test_codewords_are_values_of_polynomials(k: int, n: int) -> None:
     coefficients = np.random.default_rng(k).integers(0, 1 << 16, (WIDTH // 2, k)).tolist()
-    values = [[reedsolo.gf_poly_eval(each, x) for each in coefficients] for x in points()[:n]]
+    values = [[reedsolo.gf_poly_eval(coefficient, x) for coefficient in coefficients] for x in points()[:n]]
     expected = np.array(values, ">u2").view(np.uint8)
     assert np.array_equal(Codewords(1, n, k, WIDTH).encode(expected[:k].tobytes()), expected)
 

@@ -27,7 +27,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_model(folder / "carried.ply", embed(trained_like(1500), [(KEY, trained_like(COUNT, 1))]))
     write_key(folder / "key", KEY)
     write_key(folder / "other")
-    for suffix in (suffix for each in FORMATS for suffix in each.suffixes):
+    for suffix in (suffix for model_format in FORMATS for suffix in model_format.suffixes):
         write_model(folder / f"plain{suffix}", random_gaussians(COUNT))
     return folder
 

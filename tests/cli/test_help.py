@@ -39,6 +39,14 @@ def test_example_and_common_options(keyss: Run, command: str) -> None:
     assert "nothing here" not in out
 
 
+@pytest.mark.parametrize("columns", [60, 80, 100, 120])
+def test_numbers_are_not_broken(keyss: Run, columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The parser breaks lines at commas."""
+    monkeypatch.setenv("COLUMNS", str(columns))
+    for command in COMMANDS:
+        assert not re.search(r"\d,\s*│?\n│?\s*\d", keyss(command, "--help").out)
+
+
 def test_presets(keyss: Run) -> None:
     assert f"--preset {{{','.join(FIT_PRESETS)}}}" in keyss("fit", "--help").out
     for name in registry.METHODS:
@@ -89,6 +97,8 @@ def test_usage_errors(keyss: Run, arguments: tuple[str, ...]) -> None:
         (("frobnicate",), "see `keyss --help`"),
         (("convert", "a.ply", "-o", "b.spz"), "name OUT after IN"),
         (("audit", "run", "-o", "x"), "results go into the folder of the run"),
+        (("audit", "run", "--quick"), "--only PART"),
+        (("hide", "--cover", "a", "--secret", "b", "-o", "c", "--quick"), "give --preset quick"),
     ],
 )
 def test_misspelt_command(keyss: Run, arguments: tuple[str, ...], expected: str) -> None:

@@ -11,7 +11,7 @@ from PIL import Image
 
 import keyss as library
 from channels.lsb.trained_like import trained_like
-from cli.harness import SMALL, Run
+from cli.harness import SMALL, Run, assert_refused
 from files.scene_files import write_nerfstudio
 from keyss.files import load_scene, write_model
 from keyss.fitting import FitConfig
@@ -72,7 +72,31 @@ def test_capacity(keyss: Run, tmp_path: Path) -> None:
     write_model(tmp_path / "cover.ply", trained_like(1500))
     assert "--format" not in keyss("info", tmp_path / "cover.ply").out
     out = keyss("info", tmp_path / "cover.ply", "--capacity").out
-    assert re.search(r"capacity +--format ply: \d+,\d+ bytes, a model of about \d+,?\d* Gaussians", out)
+    assert re.search(
+        r"--format ply: \d+,\d+ bytes, a model of about \d+,?\d* Gaussians of SH degree 3 or \d+,?\d* ", out
+    )
     for words in ("--format spz: ", "--format sog: ", "--format compressed-ply: ", "--channel colours: "):
         assert words in out
     assert "--publish converted: any secret" in out
+
+
+def test_capacity_is_of_a_model(keyss: Run, workspace: Path) -> None:
+    run = workspace / "hidden"
+    for folder, cure in ((workspace / "a", "`keyss fit`"), (run, f"such as {run}/publish/model.ply")):
+        assert_refused(keyss("info", folder, "--capacity"), 2, f"{folder}: --capacity is of a model")
+        assert cure in keyss("info", folder, "--capacity").err
+
+
+def test_folders_of_a_run(keyss: Run, workspace: Path) -> None:
+    run = workspace / "hidden"
+    assert_refused(keyss("info", run / "private"), 4, f"a folder in one; give {run}")
+    assert_refused(keyss("info", workspace), 4, f"found a folder of runs; give one, such as {run}")
+
+
+def test_hidden_files(keyss: Run, workspace: Path, tmp_path: Path) -> None:
+    write_model(tmp_path / "cover.ply", trained_like(1500))
+    (tmp_path / "letter.txt").write_text("a letter")
+    cover = ("--cover", tmp_path / "cover.ply", "--key-file", workspace / "key.txt")
+    assert keyss("hide", *cover, "--secret-file", tmp_path / "letter.txt", "-o", tmp_path / "run").status == 0
+    assert re.search(r"kind +hiding of files", keyss("info", tmp_path / "run").out)
+    assert "--format spz: " in keyss("info", tmp_path / "run", "--capacity").out

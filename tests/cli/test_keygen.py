@@ -60,4 +60,4 @@ def test_key_file(keyss: Run, tmp_path: Path, umask: None) -> None:
     path.with_name("link").symlink_to(tmp_path / "elsewhere")
     assert_refused(keyss("keygen", "-o", tmp_path / "link"), 5, "never replaced")
     assert_refused(keyss("keygen", "-o", tmp_path / "none" / "key"), 5, "No such file")
-    assert {each.name for each in tmp_path.iterdir()} == {"key.txt", "link"}
+    assert {path.name for path in tmp_path.iterdir()} == {"key.txt", "link"}

@@ -22,7 +22,7 @@ def test_min_psnr(keyss: Run, workspace: Path, tmp_path: Path) -> None:
     assert {path.name for path in (tmp_path / "run").iterdir()} == {"private"}
     result = keyss(*hide, "--min-psnr", 0, "--resume")
     assert result.status == 0
-    assert "plain model of the secret (b): 43 steps, continuing at 43" in result.err
+    assert "plain model of the secret (b): 20 steps, continuing at 20" in result.err
     assert (tmp_path / "run" / "publish" / "model.ply").exists()
 
 

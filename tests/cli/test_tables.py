@@ -32,7 +32,7 @@ def test_rows() -> None:
         ["on test photos", "PSNR", "SSIM", "bound", "loss", "Gaussians", "steps"],
         ["cover", "30.00", "0.500", "30.50", "0.50", "1,234", "10"],
         ["secret", "20.00", "0.250", "567", "20"],
-        ["PSNR in dB."],
+        ["PSNR in dB; bound: PSNR of plain 3DGS with the same steps; loss: bound - PSNR."],
     ]
     assert rows[-1] == ["Capacity of the cover: 1,000 Gaussians."]
 
@@ -79,4 +79,12 @@ def test_shorter_plain_model_is_no_bound() -> None:
         *("Gaussians", "steps"),
     ]
     assert rows[2] == ["secret", "20.00", "0.250", "19.00", "567", "20"]
-    assert any(row[0].startswith("Start:") for row in rows)
+    assert any("; start: PSNR of a plain model with fewer steps" in row[0] for row in rows)
+
+
+def test_every_table_has_a_legend() -> None:
+    shorter = replace(METRICS.baseline, secrets=(ImageQuality(19.0, 0.2),), gaussians=(1234, 8406))
+    with redirect_stdout(io.StringIO()) as out:
+        print_hiding(replace(METRICS, baseline=shorter), brief=True)
+    for word in ("bound", "loss", "start", "plain"):
+        assert f"; {word}: " in out.getvalue()

@@ -119,7 +119,7 @@ def spz(degree: int) -> Callable[[int], Files]:
 def spz4(size: int) -> Files:
     count = max(1 << 17, size // 11)
     sizes = [count * each for each in (9, 1, 3, 3, 4, 45)]
-    packed = [zstandard.ZstdCompressor().compress(bytes(each)) for each in sizes]
+    packed = [zstandard.ZstdCompressor().compress(bytes(size)) for size in sizes]
     pad = bytes(max(0, size - sum(map(len, packed))))
     header = struct.pack("<4sIIBBBB", b"NGSP", 4, count, 3, 12, 0, 6) + struct.pack(
         "<I12s", 32 + len(pad), b""

@@ -152,7 +152,9 @@ def test_fine_tuning_repairs_visible_gaussians_only(scene: Scene) -> None:
 
 
 def by(format: str, tool: str) -> Converter:
-    (found,) = (each for each in converters() if (each.format, each.tool) == (format, tool))
+    (found,) = (
+        converter for converter in converters() if (converter.format, converter.tool) == (format, tool)
+    )
     return found
 
 

@@ -54,7 +54,7 @@ class GpuMode(TorchFunctionMode):
             with GpuMode(checks=False):
                 return func(*args, **kwargs)
         tensors = [each for each in tree_leaves((args, kwargs)) if isinstance(each, Tensor)]
-        there = any(isinstance(each, GpuTensor) for each in tensors)
+        there = any(isinstance(tensor, GpuTensor) for tensor in tensors)
         if there and func in _TO_HOST:
             raise TypeError("can't convert cuda:0 device type tensor to numpy")
         wanted = [name for each in tree_leaves((args, kwargs)) if (name := _device(each)) is not None]
@@ -62,7 +62,9 @@ class GpuMode(TorchFunctionMode):
             wanted.append("cuda" if isinstance(tensors[1], GpuTensor) else "cpu")
         moves = bool(wanted) or func in (Tensor.cpu, Tensor.cuda)
         if self.checks and there and not moves and func not in _CROSSING:
-            foreign = [each.shape for each in tensors if not isinstance(each, GpuTensor) and each.dim() > 0]
+            foreign = [
+                tensor.shape for tensor in tensors if not isinstance(tensor, GpuTensor) and tensor.dim() > 0
+            ]
             if foreign:
                 raise RuntimeError(
                     f"{func}: expected all tensors to be on one device, got {foreign} on the CPU"
@@ -75,7 +77,7 @@ class GpuMode(TorchFunctionMode):
         result = func(*here[0], **here[1])
         if moves and tensors and isinstance(result, Tensor) and goes != isinstance(args[0], GpuTensor):
             result = result.clone() if result.data_ptr() == args[0].data_ptr() else result
-        if any(result is each for each in tensors):
+        if any(result is tensor for tensor in tensors):
             return result
         return tree_map(lambda each: _placed(each, goes), result)
 

@@ -29,18 +29,20 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(function)
     def launch(*arguments: Any) -> Any:
         with torch._C.DisableTorchFunction():
-            for each in arguments:
-                if isinstance(each, Tensor):
-                    assert isinstance(each, GpuTensor) or torch._C._current_graph_task_id() != -1, (
+            for argument in arguments:
+                if isinstance(argument, Tensor):
+                    assert isinstance(argument, GpuTensor) or torch._C._current_graph_task_id() != -1, (
                         "on the CPU"
                     )
-                    assert each.is_contiguous()
-                    assert not each.is_floating_point() or each.dtype == torch.float32, each.dtype
-            results = function(*(as_cpu(each) if isinstance(each, Tensor) else each for each in arguments))
+                    assert argument.is_contiguous()
+                    assert not argument.is_floating_point() or argument.dtype == torch.float32, argument.dtype
+            results = function(
+                *(as_cpu(argument) if isinstance(argument, Tensor) else argument for argument in arguments)
+            )
             if isinstance(results, Tensor):
                 return results.as_subclass(GpuTensor)
             return tuple(
-                each.as_subclass(GpuTensor) if isinstance(each, Tensor) else each for each in results
+                result.as_subclass(GpuTensor) if isinstance(result, Tensor) else result for result in results
             )
 
     return launch

@@ -90,4 +90,4 @@ def test_file_round_trip(model: DecodedGaussians, tmp_path: Path) -> None:
         write_model(tmp_path / "a.ply", model)
     with pytest.raises(UsageError, match="network"):
         write_model(tmp_path / f"b{DECODED_SUFFIX}", random_gaussians(10))
-    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]

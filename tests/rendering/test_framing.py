@@ -57,9 +57,10 @@ def _rotation(up: list[float]) -> torch.Tensor:
     return torch.stack([x, torch.linalg.cross(z, x), z], dim=1)
 
 
-@pytest.mark.parametrize("distance", [6.0, 12.0, 100.0])
-def test_fog_is_ignored(distance: float) -> None:
-    alone, surrounded = frame_of(subject()), frame_of(Gaussians.cat([subject(), fog(distance=distance)]))
+@pytest.mark.parametrize(("distance", "size"), [(6.0, 15.0), (12.0, 15.0), (100.0, 15.0), (12.0, 1.4)])
+def test_fog_is_ignored(distance: float, size: float) -> None:
+    around = fog(distance=distance, size=size)
+    alone, surrounded = frame_of(subject()), frame_of(Gaussians.cat([subject(), around]))
     assert np.linalg.norm(surrounded.middle - alone.middle) < 0.1
     assert 0.5 < surrounded.radius / alone.radius < 1.5
 
@@ -82,6 +83,20 @@ def test_up_is_floor_normal(name: str) -> None:
 
 def test_up_without_floor() -> None:
     assert frame_of(subject()).up.tolist() == [0, -1, 0]
+
+
+def test_wall_is_no_floor() -> None:
+    """Captures begin in front of their subject: a wall is behind it, where the first camera looks."""
+    wall = on_a_floor([0.0, 0, -1])  # which lies at z = 0.6
+    assert frame_of(wall).up.tolist() == [0, -1, 0]
+
+
+@pytest.mark.parametrize("share", [0.12, 0.3])
+def test_small_floor_of_a_tilted_capture(share: float) -> None:
+    up = np.array(FLOORS["tilted"]) / np.linalg.norm(FLOORS["tilted"])
+    model = on_a_floor(FLOORS["tilted"])  # the floor, then the ball
+    some = torch.cat([torch.arange(int(share * 2500)), torch.arange(2500, 5000)])
+    assert frame_of(model[some]).up @ up > np.cos(np.radians(10))
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])

@@ -35,6 +35,6 @@ def test_duplicates_match_pairwise_comparison() -> None:
     repeated.means[:5] = 0.0
     repeated.means[3000:3900:2] = 0.0
     repeated.means[rows[::2]] = -0.0  # equals 0
-    columns = [getattr(repeated, each.name).reshape(len(repeated), -1) for each in fields(repeated)]
+    columns = [getattr(repeated, field.name).reshape(len(repeated), -1) for field in fields(repeated)]
     expected = len(repeated) - len(torch.unique(torch.cat(columns, dim=1), dim=0))
     assert check_model(repeated).duplicates == expected > 500

@@ -185,7 +185,7 @@ def write_counted() -> None:
         if path.suffix != ".json" and isinstance(model := read_model(path), CodedGaussians):
             bits[path.name] = carrier_bits(model)
     numbers = [0.0, 1.0, -3.0, 0.75, 1e-5, 6.5e4, 5e-324, -1e-310, 2.0**-1022, 1.7e308, 2.0**-14 * 1.0001]
-    logs = {repr(each): float(_log2(np.array([each]))[0]) for each in numbers}
+    logs = {repr(number): float(_log2(np.array([number]))[0]) for number in numbers}
     (FOLDER / "counted.json").write_text(json.dumps({"bits": bits, "log2": logs}, indent=1) + "\n")
 
 
@@ -204,7 +204,7 @@ def write_encoded() -> None:
     seen.opacity_logits[3] = -14
     two_blocks = trained_like(20, 11, 0)[torch.arange(BLOCK + 100) % 20]  # equal Gaussians take few bytes
     models = [seen, far, trained_like(10, 10, 1)[:1], two_blocks]
-    encoded = [encode(each) for each in models]
+    encoded = [encode(model) for model in models]
     found = [{"data": data.hex(), "sha256": digests(decode(data))} for data in encoded]
     (FOLDER / "encoded.json").write_text(json.dumps(found, indent=1) + "\n")
 
@@ -244,7 +244,9 @@ def some_frame() -> Similarity:
 def decode_rows(payload: bytes, stego: Gaussians) -> dict[str, Any]:
     """Number of Gaussians that a payload reveals, and every 49th of them."""
     model = KeyssSecret.of(Payload("keyss", payload)).reveal(stego)
-    rows = {each.name: getattr(model[::STRIDE], each.name).flatten().tolist() for each in fields(Gaussians)}
+    rows = {
+        field.name: getattr(model[::STRIDE], field.name).flatten().tolist() for field in fields(Gaussians)
+    }
     return {"count": len(model), "rows": {name: [round(v, 7) for v in each] for name, each in rows.items()}}
 
 
@@ -257,12 +259,12 @@ def digests(model: Gaussians) -> dict[str, str]:
 def write_revealed(key: str) -> None:
     write_model(FOLDER / "pruned.ply", pruned_model())
     opened = [open_file(name, key) for name in ("carried.ply", "keyss.ply")]
-    opened += [open_file("pruned.ply", each) for each in TWO_KEYS]
+    opened += [open_file("pruned.ply", key) for key in TWO_KEYS]
     write_model(FOLDER / "bare.ply", bare_model())
     opened.append(open_file("bare.ply", TWO_KEYS[0]))
     for suffix in quantised.FORMATS:
         write_coded(suffix)
-        opened += [open_file(f"coded{suffix}", each) for each in TWO_KEYS]
+        opened += [open_file(f"coded{suffix}", key) for key in TWO_KEYS]
         write_decoded(suffix)
         opened.append(open_file(f"decoded-{suffix.split('.')[1]}.ply", TWO_KEYS[0]))
     write_surviving(FOLDER, TWO_KEYS)

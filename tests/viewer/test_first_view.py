@@ -25,7 +25,7 @@ def camera_at(pose: str, width: int, height: int) -> Camera:
     axes = {"z": [0.0, 0, 1], "-y": [0.0, -1, 0]}
     up = axes.get(",".join(numbers.get("up", ["-y"])))
     eye, target, up = (
-        torch.tensor([float(each) for each in values]).double()
+        torch.tensor([float(value) for value in values]).double()
         for values in (numbers["eye"], numbers["target"], up or numbers["up"])
     )
     forward = torch.nn.functional.normalize(target - eye, dim=0)

@@ -149,8 +149,8 @@ def hide(
         published = with_extras(
             stego.gaussians, cover if cover_model is None else cover_model, sources[0].model
         )
-        # Images of given models take their place from here on, which frees memory for the revealed ones.
-        prepared = replace(prepared, carrier=None)
+        # Test renders replace given models, which frees memory for the revealed ones.
+        prepared = replace(prepared, capacity=None)
         sources = [source if source.photos else replace(source, given=None) for source in sources]
         with reporter.waiting("reading the published file, and comparing renders", cost.check_seconds):
             models = _write_and_read(stego, published, given.keys, folder)

@@ -21,7 +21,7 @@ from keyss.progress import Reporter
 from keyss.rendering.orbit import is_model, psnr_between
 from keyss.runs.estimates import seconds_for
 from keyss.runs.files import STEGOS, PathLike, as_3dgs_model, stego_name
-from keyss.runs.folder import RunFolder
+from keyss.runs.folder import HIDE_FILES, RunFolder
 
 _MOST = 10  # times the estimated capacity; no channel holds more
 
@@ -41,7 +41,7 @@ def hide_files(
     folder, inputs = None, [cover, *(secret.file for secret in secrets)]
     if out is not None and not dry_run:
         paths = [Path(path) for path in inputs if isinstance(path, str | Path)]
-        folder = RunFolder(out, "hide files", writes=STEGOS, inputs=paths, overwrite=overwrite)
+        folder = RunFolder(out, HIDE_FILES, writes=STEGOS, inputs=paths, overwrite=overwrite)
     seconds = 0.0 if isinstance(cover, Gaussians) else seconds_for("hide a file", Path(cover))
     with reporter.waiting("hiding", seconds):
         files, model = [_read(secret) for secret in secrets], as_3dgs_model(cover, "the cover")

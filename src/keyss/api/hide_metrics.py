@@ -65,7 +65,7 @@ def check_quality(
         who = "the cover" if index == 0 else "the secret" if len(shown) == 2 else f"secret {index}"
         pruned = len(model) < before.gaussians
         kept = f" with {len(model):,} of {before.gaussians:,} Gaussians" if pruned else ""
-        fact = f"{who}{kept} is at {fidelity.psnr:.1f} dB PSNR to its plain model"
+        fact = f"{who}{kept} is at {fidelity.psnr:.2f} dB PSNR to its plain model"
         cure = '; `publish="converted"` keeps all of them, and shows that there is a secret' * (
             pruned and not prepared.survives
         )

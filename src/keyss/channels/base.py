@@ -20,8 +20,8 @@ from keyss.core.gaussians import Gaussians
 def first_shares(shares: Sequence[tuple[float, int]], sizes: Sequence[int]) -> list[int] | None:
     """For each size, the index of the first of `shares` that holds it; None if they exceed the whole.
 
-    `shares`: part of the whole capacity, and bytes that it holds, in ascending order. A secret's share does
-    not depend on others, which its key would reveal.
+    `shares`: part of the whole capacity, and bytes that it holds, in ascending order. The share of a secret
+    depends on its own size only: otherwise its key would reveal that there are others.
     """
     chosen = [next((i for i, (_, most) in enumerate(shares) if size <= most), None) for size in sizes]
     fitting = [index for index in chosen if index is not None]
@@ -43,8 +43,8 @@ class Capacity:
         overhead: int, shares: Sequence[tuple[float, int]], equal: Callable[[int], int], grows: bool = False
     ) -> Capacity:
         """The capacity for data, from that for sealed payloads: they take up to `overhead` bytes more."""
-        own = tuple((part, max(0, size - overhead)) for part, size in shares)
-        return Capacity(own, lambda count: max(0, equal(count) - overhead), grows)
+        payload_shares = tuple((part, max(0, size - overhead)) for part, size in shares)
+        return Capacity(payload_shares, lambda count: max(0, equal(count) - overhead), grows)
 
     @property
     def bytes(self) -> int:

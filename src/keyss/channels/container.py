@@ -31,13 +31,13 @@ import numpy as np
 
 from keyss.channels.reed_solomon import Codewords
 from keyss.core.arrays import Bytes, Integers
-from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError
+from keyss.core.errors import InputError, KeyssWarning, UsageError, WrongKeyError, of_other_version
 from keyss.keys.derivation import DerivedKey, expand, stream
 from keyss.keys.encryption import OVERHEAD, compressed_size, decrypt, encrypt
 
 METHOD_BYTES = 15  # maximum length of a method's name
 MAX_OVERHEAD = OVERHEAD + METHOD_BYTES + 1  # bytes of a sealed payload beside its data and record, at most
-SALTS_TRIED = 4  # with half of the Gaussians changed, 15 of 16 models still open
+SALTS_TRIED = 4  # if half of the Gaussians changed, all four salts did in one of 16 models
 _NOT_INDEPENDENT = (
     "the secrets are too large, or too many, to be placed independently of each other: whoever holds one of "
     "the keys can notice that there are other secrets"
@@ -147,7 +147,7 @@ class Parameters:
             return None
         version, *fields = _PARAMETERS.unpack_from(packed, _CHECK_BYTES)
         if version != _VERSION:
-            raise InputError(f"hidden secret of version {version}; this program reads version {_VERSION}")
+            raise InputError(of_other_version(version, _VERSION))
         return Parameters(*fields)
 
 

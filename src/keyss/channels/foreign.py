@@ -85,13 +85,13 @@ def bloom_filter(secret: bytes, ids: Bytes, size: int, among: Integers | int) ->
     return np.packbits(bits, bitorder="little").tobytes()
 
 
-def foreign_share(secret: bytes, ids: Bytes, own: bytes, among: Integers | int, gone: float = 0.0) -> float:
+def foreign_share(secret: bytes, ids: Bytes, bloom: bytes, among: Integers | int, gone: float = 0.0) -> float:
     """Estimated share, 0 to 1, of foreign Gaussians among those with `ids` [M, 16], by the filter `own`.
 
     `among` [M]: as in `bloom_filter`, if Gaussians count in inverse proportion to it; else the number of its
     Gaussians. 1 if less than a share `gone` of the Bloom filter's sample, rounded down, is there.
     """
-    unset = np.unpackbits(np.frombuffer(own, np.uint8), bitorder="little") == 0
+    unset = np.unpackbits(np.frombuffer(bloom, np.uint8), bitorder="little") == 0
     places = _places(secret, ids, among, len(unset))
     if isinstance(among, int):
         unset = unset[:among]
@@ -116,8 +116,8 @@ def exact_record(secret: bytes, ids: Bytes) -> bytes:
 
 def exact_foreign(record: bytes, secret: bytes, ids: Bytes) -> int:
     """Estimated number of foreign Gaussians among those with `ids` [M, 16]."""
-    count, own = _EXACT.unpack(record)
-    return math.ceil(len(ids) * foreign_share(secret, ids, own, count))
+    count, bloom = _EXACT.unpack(record)
+    return math.ceil(len(ids) * foreign_share(secret, ids, bloom, count))
 
 
 @dataclass(frozen=True)
@@ -171,8 +171,8 @@ def coarse_record(secret: bytes, cover: Gaussians, appended: int, to_own: Simila
     """The record of a cover and the number of Gaussians `appended` to it; `to_own`: world to own frame."""
     rows = _Rows.of(cover, to_own, secret, reading=False)
     area = float(np.float32(rows.areas.sum()))
-    own = bloom_filter(secret, rows.ids, _BLOOM_BYTES, rows.among(len(rows.ids), area))
-    return _COARSE.pack(_faint(cover) + appended, rows.outside, len(rows.ids), area, own)
+    bloom = bloom_filter(secret, rows.ids, _BLOOM_BYTES, rows.among(len(rows.ids), area))
+    return _COARSE.pack(_faint(cover) + appended, rows.outside, len(rows.ids), area, bloom)
 
 
 def coarse_foreign(record: bytes, secret: bytes, model: Gaussians, to_own: Similarity) -> int:
@@ -180,10 +180,10 @@ def coarse_foreign(record: bytes, secret: bytes, model: Gaussians, to_own: Simil
 
     0 if they are at most a share _LEAST_SHARE. All are foreign if hardly anything is left of the cover.
     """
-    faint, outside, count, area, own = _COARSE.unpack(record)
+    faint, outside, count, area, bloom = _COARSE.unpack(record)
     here, rows = _faint(model), _Rows.of(model, to_own, secret, reading=True)
     visible = len(model) - here
-    foreign = foreign_share(secret, rows.ids, own, rows.among(count, area), _GONE)
+    foreign = foreign_share(secret, rows.ids, bloom, rows.among(count, area), _GONE)
     sure = round(foreign * visible) if foreign > _LEAST_SHARE else 0
     if rows.outside > outside + _LEAST_SHARE * visible:
         sure = max(sure, rows.outside - outside)

@@ -78,11 +78,11 @@ class Codewords:
         if too few are left.
         """
         inside = np.flatnonzero(numbers < self.shards)
-        own = numbers[inside]
-        if len(own) >= self.count * self.k:  # otherwise save the memory
+        places = numbers[inside]
+        if len(places) >= self.count * self.k:  # otherwise save the memory
             first = np.full(self.shards, -1)
-            first[own[::-1]] = inside[::-1]
-            again = inside[first[own] != inside]
+            first[places[::-1]] = inside[::-1]
+            again = inside[first[places] != inside]
             differ = (shards[again] != shards[first[numbers[again]]]).any(axis=1)
             first[numbers[again[differ]]] = -1
             rows: Integers = first.reshape(self.n, self.count)
@@ -92,14 +92,14 @@ class Codewords:
                 data: Bytes = shards[rows[: self.k]]
                 _restore(shards, rows, data)
                 return data.tobytes()
-        raise InputError(f"{LOST}: {len(np.unique(own)):,} of {self.shards:,} shards are left")
+        raise InputError(f"{LOST}: {len(np.unique(places)):,} of {self.shards:,} shards are left")
 
     def _drop_errors(self, rows: Integers, shards: Bytes) -> None:
         """Set the `rows` [n, count] of false shards to -1."""
-        for own in rows.T:
-            numbers = np.flatnonzero(own >= 0)
+        for column in rows.T:
+            numbers = np.flatnonzero(column >= 0)
             if len(numbers) > self.k:
-                own[numbers[~_consistent_rows(numbers, shards[own[numbers]], self.k, self.n)]] = -1
+                column[numbers[~_consistent_rows(numbers, shards[column[numbers]], self.k, self.n)]] = -1
 
 
 def _tables() -> tuple[Shorts, Integers]:
@@ -139,10 +139,10 @@ def _restore(shards: Bytes, rows: Integers, data: Bytes) -> None:
     """
     columns = shards.shape[1] // SYMBOL_BYTES
     wanted = np.flatnonzero((rows[: len(data)] < 0).any(axis=0))
-    own, logarithms, twiddles, walsh = rows[:, wanted], _LOGARITHMS, *_constants(_size(len(rows)))
+    values, logarithms, twiddles, walsh = rows[:, wanted], _LOGARITHMS, *_constants(_size(len(rows)))
 
     def restore(start: int, stop: int) -> None:
-        _restore_columns(start, stop, shards, own, wanted, data, _POWERS, logarithms, twiddles, walsh)
+        _restore_columns(start, stop, shards, values, wanted, data, _POWERS, logarithms, twiddles, walsh)
 
     in_blocks(restore, len(wanted) * columns, _COLUMNS, _restore_columns)
 
@@ -208,28 +208,28 @@ def _restore_columns(
     products = np.ones((last - first + 1, size), np.int64)  # L' at lost points, else L, as logarithms
     work = np.zeros((size, stop - start), np.uint16)
     for codeword in range(first, last + 1):
-        own = products[codeword - first]
+        tables = products[codeword - first]
         offset = codeword * columns - start
         for point in range(len(rows)):
-            own[point] = rows[point, codeword] < 0
-        _multiply_differences(own, walsh)
+            tables[point] = rows[point, codeword] < 0
+        _multiply_differences(tables, walsh)
         for point in range(len(rows)):
             row = rows[point, codeword]
             if row >= 0:
                 for at in range(max(0, offset), min(stop - start, offset + columns)):
                     symbol = shards[row, 2 * (at - offset)] << 8 | shards[row, 2 * (at - offset) + 1]
-                    work[point, at] = powers[own[point] + logarithms[symbol]]
+                    work[point, at] = powers[tables[point] + logarithms[symbol]]
     _to_coefficients(work, twiddles)
     _differentiate(work)
     _to_values(work, twiddles)
     for codeword in range(first, last + 1):
-        own = products[codeword - first]
+        tables = products[codeword - first]
         offset = codeword * columns - start
         for point in range(min(len(rows), len(data))):
             if rows[point, codeword] < 0:
                 shard = data[point, wanted[codeword]]
                 for at in range(max(0, offset), min(stop - start, offset + columns)):
-                    symbol = powers[65535 - own[point] + logarithms[work[point, at]]]
+                    symbol = powers[65535 - tables[point] + logarithms[work[point, at]]]
                     shard[2 * (at - offset)], shard[2 * (at - offset) + 1] = symbol >> 8, symbol & 255
 
 
@@ -321,22 +321,22 @@ def _consistent_rows(numbers: Integers, rows: Bytes, k: int, n: int) -> Flags:
 
 def _recurrence(sums: list[int]) -> list[int]:
     """Coefficients, 1 first, of the shortest linear recurrence of a sequence (Berlekamp-Massey)."""
-    found, before, length, since, scale = [1], [1], 0, 1, 1
+    locator, before, length, since, scale = [1], [1], 0, 1, 1
     for index in range(len(sums)):
         discrepancy = 0
-        for each, coefficient in enumerate(found[: length + 1]):
-            discrepancy ^= _product(coefficient, sums[index - each])
+        for power, coefficient in enumerate(locator[: length + 1]):
+            discrepancy ^= _product(coefficient, sums[index - power])
         if discrepancy == 0:
             since += 1
             continue
         factor = _product(discrepancy, int(_POWERS[_ORDER - _LOGARITHMS[scale]]))
-        shifted = [0] * since + [_product(factor, each) for each in before]
-        kept, found = found, [a ^ b for a, b in zip_longest(found, shifted, fillvalue=0)]
+        shifted = [0] * since + [_product(factor, value) for value in before]
+        kept, locator = locator, [a ^ b for a, b in zip_longest(locator, shifted, fillvalue=0)]
         if 2 * length <= index:
             length, before, scale, since = index + 1 - length, kept, discrepancy, 1
         else:
             since += 1
-    return found
+    return locator
 
 
 def _product(a: int, b: int) -> int:

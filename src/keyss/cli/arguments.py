@@ -32,6 +32,10 @@ KeyFiles = Annotated[
     UseAppendAction[tuple[Path, ...]],
     optional("FILE", "Key file, one for each secret; - for stdin.", "KEYSS_KEY or a prompt"),
 ]
+OneKeyFile = Annotated[
+    UseAppendAction[tuple[Path, ...]],
+    optional("FILE", "Key file; - for stdin.", "KEYSS_KEY or a prompt"),
+]
 KeyFilesToCheck = Annotated[
     UseAppendAction[tuple[Path, ...]],
     optional("FILE", "Key file of a secret to check; repeat for more.", "KEYSS_KEY, else no key"),
@@ -39,13 +43,14 @@ KeyFilesToCheck = Annotated[
 Preset = Annotated[
     Literal["quick", "default", "full"],
     arg(
-        help="Training steps and maximum number of Gaussians of each model: quick 500 and 10,000; default "
-        "1,000 and 30,000, on CUDA as full; full 30,000 and 500,000, on CUDA 1,000,000."
+        # The parser breaks lines at any comma.
+        help="Training steps and maximum number of Gaussians of each model: quick 500 and 10k; default 1k "
+        "and 30k, on CUDA as full; full 30k and 500k, on CUDA 1M."
     ),
 ]
 Width = Annotated[int | None, optional("PIXELS", "Downscale wider photos to this width.")]
 Iterations = Annotated[
-    int | None, optional("N", "Training steps of a model, and of fine-tuning.", "the preset's")
+    int | None, optional("N", "Training steps of each model, and of fine-tuning.", "the preset's")
 ]
 MaxGaussians = Annotated[int | None, optional("N", "Maximum number of Gaussians of a model.", "the preset's")]
 Overwrite = Annotated[bool, switch("Replace existing results.")]

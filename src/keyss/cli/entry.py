@@ -30,6 +30,11 @@ OUT_OF_MEMORY = 8
 INTERNAL_ERROR = 70  # EX_SOFTWARE
 _LEVELS = {"-q": -1, "--quiet": -1, "-v": 1, "--verbose": 1}
 _KEY_OPTIONS = ("-k", "-p", "--key", "--keys", "--password", "--passphrase")  # options that people may expect
+# Options that take the place of --quick, and how.
+_QUICKER = {
+    "preset": "give --preset quick",
+    "only": "--only PART audits one part, and --dry-run prints the time of each",
+}
 # Arguments whose options have another name.
 _RENAMED = {"key": "key_file", "keys": "key_file", "secrets": "secret", "model": "secret_model"}
 
@@ -92,6 +97,10 @@ def _run(arguments: list[str], options: set[str]) -> None:
     if "out" not in options and {"-o", "--out"} & {word.partition("=")[0] for word in rest}:
         where = "name OUT after IN" if name == "convert" else "results go into the folder of the run, if any"
         raise UsageError(f"`keyss {name}` has no option -o: {where}; see `keyss {name} --help`")
+    if "--quick" in rest and "quick" not in options:
+        for option, cure in _QUICKER.items():
+            if option in options:
+                raise UsageError(f"`keyss {name}` has no option --quick: {cure}")
     tyro.cli(command, prog=f"keyss {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))
 
 

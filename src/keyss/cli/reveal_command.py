@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from keyss.cli.arguments import Device, KeyFiles, KeyFilesToCheck, Overwrite, check_exists, optional, switch
+from keyss.cli.arguments import Device, KeyFilesToCheck, OneKeyFile, Overwrite, check_exists, optional, switch
 from keyss.cli.keys import given_keys, keys
 from keyss.core.errors import InputError
 
@@ -15,7 +15,7 @@ from keyss.core.errors import InputError
 def reveal(
     stego: Annotated[Positional[Path], arg(metavar="FILE", help="Published model, or - for stdin.")],
     *,
-    key_file: KeyFiles = (),
+    key_file: OneKeyFile = (),
     out: Annotated[
         Path,
         arg(

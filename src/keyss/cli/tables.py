@@ -29,7 +29,18 @@ if TYPE_CHECKING:
     from keyss.runs.run_records import FitMetrics, HideMetrics
 
 
-_HEADS = ("PSNR", "SSIM", "LPIPS", "bound", "loss", "start", "Gaussians", "plain", "steps")
+# Columns of the table of a hiding, with what its legend says of them.
+_HEADS = {
+    "PSNR": "PSNR in dB",
+    "SSIM": "",
+    "LPIPS": "LPIPS (AlexNet): lower is better",
+    "bound": "bound: PSNR of plain 3DGS with the same steps",
+    "loss": "loss: bound - PSNR",
+    "start": "start: PSNR of a plain model with fewer steps, no bound (`keyss hide --bound` fits one)",
+    "Gaussians": "",
+    "plain": "plain: Gaussians of the plain model",
+    "steps": "",
+}
 
 
 class Console(RichConsole):
@@ -51,9 +62,10 @@ def print_hiding(metrics: HideMetrics, *, brief: bool = False) -> None:
         first = [name + " (renders)" * (not shown) for name, shown in zip(names, metrics.photos, strict=True)]
     table = [[name, *(row.get(head, "") for head in heads)] for name, row in zip(first, rows, strict=True)]
     print_table([views, *heads], table)
-    lines = _lines_on_files(metrics, names)
+    legend = "; ".join(text for head in heads if (text := _HEADS[head]))
+    wrong_keys = [] if brief else _lines_on_wrong_keys(metrics, names)
+    lines = [f"{legend}.", *wrong_keys, *_lines_on_files(metrics, names)]
     if not brief:
-        lines = [*_explanations(metrics, names, heads), *lines]
         units = {"capacity": "Gaussians", "capacity_bytes": "bytes"}
         capacities = {unit: metrics.details[name] for name, unit in units.items() if name in metrics.details}
         lines += [f"Capacity of the cover: {number:,} {unit}." for unit, number in capacities.items()]
@@ -96,10 +108,14 @@ def _quality(of: ImageQuality) -> dict[str, str]:
 def print_plan(method: str, plan: Plan, cost: Cost) -> None:
     """Print capacity and estimates of a run."""
     steps = f", {cost.steps:,} training steps" if cost.steps else ""
+    rough = "about " if plan.capacity < plan.secret_gaussians else ""
     _print_columns(
         [
             ("method", method),
-            ("capacity", f"room for {plan.capacity:,} of the {plan.secret_gaussians:,} Gaussians to hide"),
+            (
+                "capacity",
+                f"room for {rough}{plan.capacity:,} of the {plan.secret_gaussians:,} Gaussians to hide",
+            ),
             (
                 "published",
                 f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, {plan.megabytes:,.1f} MB",
@@ -113,26 +129,18 @@ def print_plan(method: str, plan: Plan, cost: Cost) -> None:
     print("Dry run: nothing was written. Times are rough.")
 
 
-def _explanations(metrics: HideMetrics, names: Sequence[str], heads: Sequence[str]) -> list[str]:
-    """Lines on the columns of the table and, for methods with a decoder, on wrong keys and chance."""
-    meanings = {
-        "LPIPS": "LPIPS with AlexNet: lower is better.",
-        "plain": "Plain: Gaussians of the plain model.",
-        "bound": "Bound: upper bound, plain 3DGS with the same steps.",
-        "start": "Start: PSNR of a plain model with fewer training steps, no upper bound; "
-        "`keyss hide --bound` fits one.",
-    }
-    lines = ["PSNR in dB.", *(text for head, text in meanings.items() if head in heads)]
-    if (wrong := metrics.wrong_key) is not None:
-        pairs = zip(names[1:], wrong.vs_secrets, strict=True)
-        highest = ", ".join(f"{psnrs.max:.2f} to the {name}" for name, psnrs in pairs)
-        cover = f"{wrong.vs_cover.mean:.2f} to the cover, at least {wrong.vs_cover.min:.2f}"
-        lines.append(f"PSNR of {wrong.keys} wrong keys: on average {cover}; at most {highest}.")
-        chance = ", ".join(f"{psnr:.2f}" for psnr in metrics.chance_level)
-        lines.append(
-            f"Chance level: {chance}, the published model's PSNR to the secret: the limit for wrong keys."
-        )
-    return lines
+def _lines_on_wrong_keys(metrics: HideMetrics, names: Sequence[str]) -> list[str]:
+    """For methods with a decoder, lines on wrong keys and chance."""
+    if (wrong := metrics.wrong_key) is None:
+        return []
+    pairs = zip(names[1:], wrong.vs_secrets, strict=True)
+    highest = ", ".join(f"{psnrs.max:.2f} to the {name}" for name, psnrs in pairs)
+    cover = f"{wrong.vs_cover.mean:.2f} to the cover, at least {wrong.vs_cover.min:.2f}"
+    chance = ", ".join(f"{psnr:.2f}" for psnr in metrics.chance_level)
+    return [
+        f"PSNR of {wrong.keys} wrong keys: on average {cover}; at most {highest}.",
+        f"Chance level: {chance}, the published model's PSNR to the secret: the limit for wrong keys.",
+    ]
 
 
 def _lines_on_files(metrics: HideMetrics, names: Sequence[str]) -> list[str]:

@@ -104,6 +104,12 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
         ) from error
 
 
+def of_other_version(found: int, known: int) -> str:
+    """The message about a secret of another version than this program reads."""
+    cure = "update keyss" if found > known else "open it with the keyss that wrote it, and hide it again"
+    return f"secret of version {found}; this program reads version {known}: {cure}"
+
+
 def nearest(word: str, known: Collection[str]) -> str | None:
     """The most similar of the `known` names, None if none is similar."""
     matches = get_close_matches(word[:MAX_LENGTH], sorted(known), n=1, cutoff=0.7)

@@ -127,13 +127,15 @@ def colmap_models(folder: Path, places: Sequence[str] = MODEL_PLACES) -> list[Pa
 
     COLMAP writes several side by side, in numbered folders, if it cannot connect all photos.
     """
-    for place in (folder / each for each in places):
+    for place in (folder / name for name in places):
         beside = place.parent.glob("[0-9]*") if place.parent.name == "sparse" else ()
-        numbered = sorted((each for each in beside if each.name.isdecimal()), key=lambda each: int(each.name))
+        numbered = sorted(
+            (entry for entry in beside if entry.name.isdecimal()), key=lambda entry: int(entry.name)
+        )
         models = [
-            each
-            for each in numbered or [place]
-            if any((each / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
+            model
+            for model in numbered or [place]
+            if any((model / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
         ]
         if models:
             return sorted(models, key=_photo_count, reverse=True)
@@ -157,9 +159,9 @@ def _find_images(folder: Path, photos: Sequence[Photo]) -> tuple[str, list[Photo
     finder = Finder()
     for images in _IMAGE_FOLDERS:
         named = [(f"{images}/{photo.name}", photo) for photo in photos]
-        found = [(finder.find(folder, name), name, photo) for name, photo in named]
-        spelt = {path: photo for path, _, photo in found if path}
-        spelt |= {path: photo for path, name, photo in found if path == name}
+        matches = [(finder.find(folder, name), name, photo) for name, photo in named]
+        spelt = {path: photo for path, _, photo in matches if path}
+        spelt |= {path: photo for path, name, photo in matches if path == name}
         placed = {photo.name: replace(photo, path=folder / path) for path, photo in spelt.items() if path}
         if existing := [placed[photo.name] for photo in photos if photo.name in placed]:
             return images, existing
@@ -168,18 +170,18 @@ def _find_images(folder: Path, photos: Sequence[Photo]) -> tuple[str, list[Photo
 
 def _with_masks(folder: Path, photos: Sequence[Photo]) -> list[Photo]:
     """The photos with their masks, if any. Warns if no mask is named like a photo."""
-    masks, finder, found = folder / "masks", Finder(), []
+    masks, finder, masked = folder / "masks", Finder(), []
     for photo in photos if masks.is_dir() else ():
         names = (f"{photo.name}.png", f"{PurePosixPath(photo.name).with_suffix('.png')}", photo.name)
         paths = (masks / spelt for name in names if (spelt := finder.find(masks, name)))
-        found.append(replace(photo, mask=next((path for path in paths if path.is_file()), None)))
-    if found and not any(photo.mask for photo in found):
+        masked.append(replace(photo, mask=next((path for path in paths if path.is_file()), None)))
+    if masked and not any(photo.mask for photo in masked):
         warnings.warn(
             f"{masks}: no mask is used, since none is named like a photo: expected {photos[0].name}.png",
             KeyssWarning,
             stacklevel=3,
         )
-    return found or list(photos)
+    return masked or list(photos)
 
 
 def _lens(where: str, model: str, width: int, height: int, read: Callable[[int], Sequence[float]]) -> Lens:

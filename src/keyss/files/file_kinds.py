@@ -161,13 +161,13 @@ def model_file(path: Path | str) -> Path:
     path = Path(path)
     if path.is_dir() and is_unpacked_sog(path):
         return path / _META
-    if found := _latest_model(path):
+    if model := _latest_model(path):
         warnings.warn(
-            f"{path}: output of a training; its model is {found.relative_to(path)}",
+            f"{path}: output of a training; its model is {model.relative_to(path)}",
             KeyssWarning,
             stacklevel=2,
         )
-    return found or path
+    return model or path
 
 
 def identify_folder(folder: Path) -> str | None:

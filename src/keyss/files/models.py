@@ -68,11 +68,11 @@ def read_model(path: Path | str) -> Gaussians:
         return model_of_bytes("standard input", read_standard_input())
     path = model_file(path)
     if os.path.isdir(path):
-        found = identify_folder(path) or "a folder"
-        raise InputError(f"{path}: expected the file of a 3DGS model ({known_suffixes()}), found {found}")
+        kind = identify_folder(path) or "a folder"
+        raise InputError(f"{path}: expected the file of a 3DGS model ({known_suffixes()}), found {kind}")
     if not os.path.isfile(path):
-        found = "found neither a file nor a folder" if os.path.exists(path) else "but there is no such file"
-        raise InputError(f"{path}: expected a 3DGS model ({known_suffixes()}), {found}")
+        problem = "found neither a file nor a folder" if os.path.exists(path) else "but there is no such file"
+        raise InputError(f"{path}: expected a 3DGS model ({known_suffixes()}), {problem}")
     if is_unpacked_sog(path):
         return model_of_bytes(path.with_suffix(".sog"), pack_unpacked(path))
     with open_input(path) as file:
@@ -84,7 +84,7 @@ def reads_as(path: Path, model: Gaussians) -> bool:
 
     Raises InputError as `read_model` does.
     """
-    if type(model) is not Gaussians or not keeps_low_bits(path):
+    if type(model) is not Gaussians or _for_writing(path) is not PLY:
         return False
     with open_input(path) as file:
         return ply.holds(file, model)
@@ -92,8 +92,8 @@ def reads_as(path: Path, model: Gaussians) -> bool:
 
 def holds(path: Path | str, data: bytes, model: Gaussians) -> bool:
     """`reads_as` for a file at `path` that contains `data`."""
-    exact = type(model) is Gaussians and keeps_low_bits(path)
-    return exact and ply.holds(io.BytesIO(data), model)
+    is_plain_model = type(model) is Gaussians and _for_writing(path) is PLY
+    return is_plain_model and ply.holds(io.BytesIO(data), model)
 
 
 def model_of_bytes(path: Path | str, data: bytes) -> Gaussians:

@@ -88,7 +88,7 @@ def read_vertices(file: BinaryIO) -> Vertices:
     elements, comments = _read_header(file)
     index = [element.name for element in elements].index("vertex")
     before, vertex = elements[:index], elements[index]
-    size, values = sum(each.size for each in before), sum(each.values for each in before)
+    size, values = sum(element.size for element in before), sum(element.values for element in before)
     if vertex.order == _TEXT:
         # Every value takes a digit and a separator; the file's last separator may be missing.
         _check_size(file, 2 * (values + vertex.values) - 1, vertex)
@@ -136,7 +136,7 @@ def ply_header(elements: Mapping[str, tuple[int, Iterable[str]]], comments: Iter
     """
     lines = ["ply", "format binary_little_endian 1.0", *comments]
     for name, (count, properties) in elements.items():
-        lines += [f"element {name} {count}", *(f"property {each}" for each in properties)]
+        lines += [f"element {name} {count}", *(f"property {declaration}" for declaration in properties)]
     return "\n".join([*lines, "end_header\n"]).encode("latin-1")
 
 
@@ -326,7 +326,7 @@ def check_not_activated(means: Floats, log_scales: Floats, opacity_logits: Float
         "scales": bool((log_scales > 0).mean() > _NEARLY_ALL) and large,
         "opacities": low >= 0 and high <= 1 and high - low > 0.5,
     }
-    wrong = [name for name, each in activated.items() if each]
+    wrong = [name for name, is_activated in activated.items() if is_activated]
     if wrong:
         raise InputError(
             f"its {' and '.join(wrong)} are those that renderers use, where a 3DGS .ply has logarithms of "
@@ -335,22 +335,22 @@ def check_not_activated(means: Floats, log_scales: Floats, opacity_logits: Float
         )
 
 
-def model_properties(found: Collection[str]) -> list[str]:
+def model_properties(present: Collection[str]) -> list[str]:
     """Names of the properties that make a model. Raises InputError if any is missing."""
-    rest = {name for name in found if re.fullmatch(r"f_rest_[0-9]+", name)}
+    rest = {name for name in present if re.fullmatch(r"f_rest_[0-9]+", name)}
     names = model_names(len(rest) // 3 + 1)
     if len(rest) not in (0, 9, 24, 45) or not rest <= set(names):
         raise InputError(
             f"expected 0, 9, 24 or 45 properties f_rest_0, f_rest_1, ..., got {len(rest)}: export it again "
             "with harmonics of degree 0, 1, 2 or 3"
         )
-    missing = [name for name in names if name not in found]
+    missing = [name for name in names if name not in present]
     if missing == ["scale_2"]:
         raise InputError(
             "this is a 2DGS model: its Gaussians are flat and have no scale_2; open it in SuperSplat "
             "(superspl.at/editor) and export a .ply, which has one"
         )
-    if missing[:3] == names[3:6] and {"red", "green", "blue", "opacity"} <= set(found):
+    if missing[:3] == names[3:6] and {"red", "green", "blue", "opacity"} <= set(present):
         raise InputError(
             "this is a 3DGS model with colours as red, green and blue instead of harmonics (f_dc_0, ...): "
             "export it again with harmonics, from Nerfstudio with "

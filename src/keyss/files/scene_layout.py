@@ -106,27 +106,27 @@ class Finder:
     def find_end(self, folder: Path, parts: Sequence[str]) -> str | None:
         """The longest end of a path, in parts, that exists in `folder`; not all of it."""
         ends = (range(start, len(parts)) for start in range(1, len(parts)))
-        found = (self._find(folder, (parts[index] for index in end)) for end in ends)
-        return next(filter(None, found), None)
+        paths = (self._find(folder, (parts[index] for index in end)) for end in ends)
+        return next(filter(None, paths), None)
 
     def _find(self, folder: Path, parts: Iterable[str]) -> str | None:
-        here, found = os.fspath(folder), []
+        here, matches = os.fspath(folder), []
         for part in parts:
             if part in ("", "."):
                 continue
             alike = [part] if part == ".." else self._listing(here).get(_folded(part), [])
             if part not in alike and len(alike) != 1:
                 return None
-            found.append(part if part in alike else alike[0])
-            here = f"{here}/{found[-1]}"
-        return "/".join(found) if found and os.path.exists(here) else None
+            matches.append(part if part in alike else alike[0])
+            here = f"{here}/{matches[-1]}"
+        return "/".join(matches) if matches and os.path.exists(here) else None
 
     def _listing(self, folder: str) -> dict[str, list[str]]:
         """The names in a folder by their case-folded form; none in a file."""
         if folder not in self._listings:
             names: dict[str, list[str]] = {}
-            for each in os.listdir(folder) if os.path.isdir(folder) else ():
-                names.setdefault(_folded(each), []).append(each)
+            for entry in os.listdir(folder) if os.path.isdir(folder) else ():
+                names.setdefault(_folded(entry), []).append(entry)
             self._listings[folder] = names
         return self._listings[folder]
 

@@ -78,7 +78,7 @@ def load_scene(
 
     origin, extent = origin_and_extent([photo.viewmat for photo in layout.train])
     if origin.any():
-        where = ", ".join(f"{each:.9g}" for each in origin)
+        where = ", ".join(f"{coordinate:.9g}" for coordinate in origin)
         warnings.warn(
             f"{folder}: too far from the origin for single precision: the scene and its models are moved by "
             f"minus ({where})",
@@ -86,7 +86,7 @@ def load_scene(
             stacklevel=2,
         )
     near = NEAR * min(1.0, extent / ORDINARY_EXTENT)
-    photos = [replace(each, viewmat=recentre(each.viewmat, origin)) for each in layout.train + layout.test]
+    photos = [replace(photo, viewmat=recentre(photo.viewmat, origin)) for photo in layout.train + layout.test]
     probed, damaged = [], []
     for photo in photos:  # finds missing photos before decoding any
         try:
@@ -149,7 +149,7 @@ def _check_memory(folder: Path, sizes: Sequence[tuple[int, int]], width: int | N
 
 def origin_and_extent(viewmats: Sequence[Doubles]) -> tuple[Doubles, float]:
     """The origin [3] of the scene's frame, 0 unless the cameras [4, 4] are far from it, and their extent."""
-    centres = np.array([-each[:3, :3].T @ each[:3, 3] for each in viewmats])
+    centres = np.array([-viewmat[:3, :3].T @ viewmat[:3, 3] for viewmat in viewmats])
     centre = centres.mean(axis=0)
     extent, distance = float(np.linalg.norm(centres - centre, axis=1).max()), np.linalg.norm(centre)
     if extent <= _ROUNDING * distance:  # all cameras are in one place
@@ -171,8 +171,8 @@ def read_layout(folder: Path, skip_missing: bool) -> SceneLayout:
     """The photos and cameras of a scene, without decoding images. Raises InputError."""
     try:
         if not folder.is_dir():
-            found = identify_file(folder) if folder.exists() else "nothing there"
-            raise InputError(f"{folder}: expected a scene folder, found {found}. Known layouts: {_KNOWN}")
+            listing = identify_file(folder) if folder.exists() else "nothing there"
+            raise InputError(f"{folder}: expected a scene folder, found {listing}. Known layouts: {_KNOWN}")
         # In this order, because COLMAP and NeRF-synthetic scenes may contain a derived transforms.json, and
         # Nerfstudio's scenes contain their COLMAP model.
         if colmap_models(folder, MODEL_PLACES[:-1]):
@@ -186,10 +186,10 @@ def read_layout(folder: Path, skip_missing: bool) -> SceneLayout:
         entries = sorted(entry.name for entry in folder.iterdir())
     except OSError as error:
         raise InputError(f"{folder}: cannot be read: {error.strerror}") from error
-    found = ", ".join(entries[:8]) + (", ..." if len(entries) > 8 else "") or "an empty folder"
+    listing = ", ".join(entries[:8]) + (", ..." if len(entries) > 8 else "") or "an empty folder"
     if kind := identify_folder(folder):
         raise InputError(f"{folder}: expected a scene or a model, found {kind}")
-    raise InputError(f"{folder}: expected a scene, found {found}. Known layouts: {_KNOWN}")
+    raise InputError(f"{folder}: expected a scene, found {listing}. Known layouts: {_KNOWN}")
 
 
 def _fit_lenses(folder: Path, photos: Sequence[Photo], sizes: Sequence[tuple[int, int]]) -> list[Photo]:

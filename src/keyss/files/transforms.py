@@ -183,14 +183,14 @@ def _split(
     names = set(spelt.values())
 
     def listed(paths: list[str] | None) -> set[str]:
-        found = set()
-        for each in paths or ():
-            found.add(name := spelt.get(each) or _image_name(path, each, finder))
+        seen = set()
+        for listed_path in paths or ():
+            seen.add(name := spelt.get(listed_path) or _image_name(path, listed_path, finder))
             if name not in names:
                 raise InputError(
                     f"{path}: expected lists of frames, found {name[:99]!r}, which is not a frame"
                 )
-        return found
+        return seen
 
     train, test = listed(meta.train_filenames), listed(meta.test_filenames or meta.val_filenames)
     if train == names and not test:
@@ -229,8 +229,10 @@ def _relative_path(path: Path, file_path: str, finder: Finder) -> str:
 def _image_name(path: Path, file_path: str, finder: Finder) -> str:
     """The name of an image as spelt on disk, with its extension added if necessary."""
     name = _relative_path(path, file_path, finder)
-    names = (finder.find(path.parent, name + each) for each in ("", *_EXTENSIONS))
-    return next((each for each in names if each and os.path.isfile(path.parent / each)), name)
+    names = (finder.find(path.parent, name + extension) for extension in ("", *_EXTENSIONS))
+    return next(
+        (candidate for candidate in names if candidate and os.path.isfile(path.parent / candidate)), name
+    )
 
 
 def _matrix(where: str, values: object) -> Doubles:

@@ -56,7 +56,7 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
         weight of the loss, to match the thresholds of plain 3DGS.
         """
         width, height = renders[0][0]["width"], renders[0][0]["height"]
-        found = []
+        kinds = []
         for meta, indices, weight in renders:
             gradients, radii = meta["means2d"].grad[0], meta["radii"][0]  # [M, 2]
             size = gradients.new_tensor([meta["width"] / width, meta["height"] / height])
@@ -66,8 +66,8 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
             where = slice(None) if indices is None else indices
             values[0, where] = torch.where(visible, torch.linalg.vector_norm(gradients, dim=1), 0)
             values[1, where] = visible.float()
-            found.append(values)
-        return found
+            kinds.append(values)
+        return kinds
 
     def _update_state(
         self, params: Parameters, state: dict[str, Any], info: list[Tensor], packed: bool = False
@@ -129,8 +129,8 @@ class CombinedStrategy(CappedStrategy):
         growing = asking.any(1)
         if int(growing.sum()) > room:
             growing = torch.zeros_like(growing)
-            for own, count in zip(gradients.T, asking.sum(0).tolist(), strict=True):
-                growing[own.topk(min(room // scenes, count)).indices] = True
+            for norms, count in zip(gradients.T, asking.sum(0).tolist(), strict=True):
+                growing[norms.topk(min(room // scenes, count)).indices] = True
         # gsplat compares one number for each Gaussian with its threshold.
         state["grad2d"], state["count"] = growing * 2 * self.grow_grad2d, torch.ones_like(gradients[:, 0])
         grown: tuple[int, int] = DefaultStrategy._grow_gs(self, params, optimizers, state, step)

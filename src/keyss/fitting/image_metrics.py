@@ -136,9 +136,11 @@ def _weights(device: torch.device) -> tuple[list[tuple[Tensor, Tensor]], list[Te
     if hashlib.sha256(data).hexdigest() != SHA256:
         raise BackendError(f"{HOW_TO_GET} (the one installed has other weights)")
     stored = [value for opcode, value, _ in pickletools.genops(data) if opcode.name == "BINBYTES"]
-    arrays = [torch.from_numpy(np.frombuffer(each, "<f4").copy()) for each in stored if each is not None]
+    arrays = [
+        torch.from_numpy(np.frombuffer(content, "<f4").copy()) for content in stored if content is not None
+    ]
     convolutions = []
     for layer, (size, inputs) in enumerate(zip(_SIZES, _CHANNELS, strict=False)):
         kernel = arrays[2 * layer].view(size, size, inputs, _CHANNELS[layer + 1]).permute(3, 2, 0, 1)
         convolutions.append((kernel.contiguous().to(device), arrays[2 * layer + 1].to(device)))
-    return convolutions, [each.view(-1, 1, 1).to(device) for each in arrays[10:]]
+    return convolutions, [array.view(-1, 1, 1).to(device) for array in arrays[10:]]

@@ -29,7 +29,9 @@ def to_parameters(gaussians: Gaussians, device: torch.device) -> Parameters:
     """Copy the Gaussians into leaf parameters on `device`."""
     contiguous = torch.contiguous_format
     copy = gaussians.detach().to(device).map(lambda tensor: tensor.clone(memory_format=contiguous))
-    return {name: torch.nn.Parameter(each) for name, each in zip(_NAMES, vars(copy).values(), strict=True)}
+    return {
+        name: torch.nn.Parameter(tensor) for name, tensor in zip(_NAMES, vars(copy).values(), strict=True)
+    }
 
 
 def to_gaussians(parameters: Parameters) -> Gaussians:

@@ -47,7 +47,9 @@ class Schedule:
         self.boost = boost_of(config)
         chosen = cameras[:: -(-len(cameras) // _CAMERAS)]
         self.positions = camera_positions(chosen)  # [C, 3]
-        focals = [float(each.K[0, 0] * each.K[1, 1]) / (each.width * each.height) for each in chosen]
+        focals = [
+            float(camera.K[0, 0] * camera.K[1, 1]) / (camera.width * camera.height) for camera in chosen
+        ]
         self.zooms = torch.tensor(focals).sqrt() / _FOCAL  # [C]
 
     def set(self, optimizers: Optimizers, iteration: int) -> None:

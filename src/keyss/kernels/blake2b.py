@@ -52,9 +52,9 @@ def blake2b_rows(rows: Words32, person: bytes) -> Bytes:
     start = _START.copy()
     start[0] ^= np.uint64(0x01010000 | DIGEST_BYTES)
     start[6:] ^= np.array(struct.unpack("<2Q", person.ljust(16, b"\0")), np.uint64)
-    found = np.empty((len(words), DIGEST_BYTES // 8), np.uint64)
-    in_blocks(lambda low, high: _hash(words[low:high], start, found[low:high]), len(words), _ROWS, _hash)
-    return found.astype("<u8", copy=False).view(np.uint8)
+    digests = np.empty((len(words), DIGEST_BYTES // 8), np.uint64)
+    in_blocks(lambda low, high: _hash(words[low:high], start, digests[low:high]), len(words), _ROWS, _hash)
+    return digests.astype("<u8", copy=False).view(np.uint8)
 
 
 @inline

@@ -85,7 +85,7 @@ def _is_private(folder: Path) -> bool:
     if not hasattr(os, "getuid"):  # Windows, where folders inherit their owner's rights
         return True
     folder = folder.resolve()
-    states = [each.stat() for each in (folder, *folder.parents)]
+    states = [parent.stat() for parent in (folder, *folder.parents)]
     return states[0].st_uid == os.getuid() and all(
         state.st_uid in (0, os.getuid()) and (not state.st_mode & 0o022 or state.st_mode & stat.S_ISVTX)
         for state in states
@@ -97,7 +97,7 @@ def _cache_parents() -> list[Path]:
         os.environ.get("LOCALAPPDATA") or os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     )
     parents = (_numba.config.CACHE_DIR, _PACKAGE / "kernels" / "__pycache__", of_user)
-    return [Path(each) for each in parents if each and not str(each).startswith("~")]  # no home folder
+    return [Path(name) for name in parents if name and not str(name).startswith("~")]  # no home folder
 
 
 @cache

@@ -70,7 +70,7 @@ def _buffer(size: int) -> Array:
         with suppress(KeyError, IndexError):
             return _free[fitting].pop()
     for stale in list(_free):  # the oldest first: models grow
-        if sum(len(each) for each in list(_free.values())) <= MAX_FREE:
+        if sum(len(arrays) for arrays in list(_free.values())) <= MAX_FREE:
             break
         _free.pop(stale, None)
     new: Array = torch.empty(capacity, dtype=torch.uint8).numpy()

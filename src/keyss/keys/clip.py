@@ -52,7 +52,7 @@ class ClipKeys:
     def random(self, generator: torch.Generator) -> Tensor:
         """The vector of a random key of 16 alphanumeric characters (section 4.1)."""
         chosen = torch.randint(len(ALPHABET), (16,), generator=generator)
-        return self("".join(ALPHABET[int(each)] for each in chosen))
+        return self("".join(ALPHABET[int(index)] for index in chosen))
 
 
 clip_keys = lru_cache(maxsize=1)(ClipKeys)  # loads the large model once for preparing and hiding

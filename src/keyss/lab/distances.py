@@ -86,12 +86,12 @@ def attribute_distances(reference: Gaussians, other: Gaussians, *, seed: int = 0
     for name in both[0]:
         axes = [model[name].T for model in both]
         along_axes, units = _row_distances(*axes)
-        scaled = [_divide(each, units[:, None]) for each in axes]
+        scaled = [_divide(axis, units[:, None]) for axis in axes]
         directions = _directions(generator, len(units))
         along_slices, widths = _row_distances(directions @ scaled[0], directions @ scaled[1])
         result[name] = _mean(np.append(along_axes, along_slices), np.append(units, widths))
         weight = np.float32(1 / np.sqrt(max(int((units > 0).sum()), 1)))
-        rows.append([weight * each for each in scaled])
+        rows.append([weight * row for row in scaled])
     one, two = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     directions = _directions(generator, len(one))
     result["joint"] = _mean(*_row_distances(directions @ one, directions @ two))

@@ -70,7 +70,9 @@ def audit(
         from keyss.lab.audits.audit_run import forecast_audit
 
         seconds = forecast_audit(run, controls=controls, only=only, device=device)
-        print_table(("part", "time, about"), [(name, progress.about(each)) for name, each in seconds.items()])
+        print_table(
+            ("part", "time, about"), [(name, progress.about(duration)) for name, duration in seconds.items()]
+        )
         print(f"About {progress.about(sum(seconds.values()))}; controls that exist take no time.")
         print("Dry run: nothing was written. Times are rough.")
         return
@@ -108,7 +110,7 @@ def compare(
         str, optional("NAMES", "Methods, METHOD:PRESET or METHOD:VARIANT, separated by commas.", "all")
     ] = "all",
     out: OutFolder,
-    quick: Annotated[bool, switch("500 steps, 3,000 Gaussians and a width of 100 by default.")] = False,
+    quick: Annotated[bool, switch("500 steps, 3k Gaussians and a width of 100 by default.")] = False,
     iterations: Annotated[
         int | None, optional("N", "Training steps for each scene.", "the first method's, or see --quick")
     ] = None,
@@ -180,9 +182,7 @@ def reproduce(
     *,
     full: Annotated[
         bool,
-        switch(
-            "The scenes are the paper's: its pairs, 30,000 steps and 500,000 Gaussians, photos as they are."
-        ),
+        switch("The scenes are the paper's: its pairs, 30k steps and 500k Gaussians, photos as they are."),
     ] = False,
     pairs: Annotated[
         UseAppendAction[tuple[str, ...]],
@@ -194,9 +194,9 @@ def reproduce(
     ] = (),
     out: OutFolder,
     dry_run: DryRun = False,
-    iterations: Annotated[int | None, optional("N", "Training steps.", "1,000, or see --full")] = None,
+    iterations: Annotated[int | None, optional("N", "Training steps.", "1k, or see --full")] = None,
     max_gaussians: Annotated[
-        int | None, optional("N", "Maximum number of Gaussians of a model.", "9,000, or see --full")
+        int | None, optional("N", "Maximum number of Gaussians of a model.", "9k, or see --full")
     ] = None,
     width: Annotated[
         int | None, optional("PIXELS", "Downscale wider photos to this width.", "120, or see --full")

@@ -40,5 +40,5 @@ def sheet_of(columns: Sequence[tuple[str, Scene, Gaussians]], views: int = 3) ->
         heads += [name, f"{name}, {'published' if not heads else 'revealed'}"]
         pictures += [[view.image.numpy() for view in shown], [image.numpy() for _, image in renders]]
     count = min(map(len, pictures))
-    rows = {str(row + 1): [column[row] for column in pictures] for row in range(count)}
+    rows = {f"view {row + 1}": [column[row] for column in pictures] for row in range(count)}
     return contact_sheet(heads, rows)

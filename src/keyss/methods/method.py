@@ -223,7 +223,7 @@ class Prepared:
     plan: Plan
     grows: bool = False  # the file grows with the secrets
     survives: bool = False  # the secrets survive conversion to other formats
-    carrier: Any = None  # the method's own view of the cover, as large as the model
+    capacity: Any = None  # the method's own view of the cover and what it holds, as large as the model
 
     @staticmethod
     def of(options: MethodOptions, scenes: int, plan: Plan) -> Prepared:

@@ -13,7 +13,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
-from keyss.core.errors import InputError, UsageError
+from keyss.core.errors import InputError, UsageError, of_other_version
 from keyss.files.formats.decoded_models import load_tensors
 
 _ENTRY = "keyss"
@@ -54,7 +54,7 @@ def unpack_tensors(
     if declared.format != format:
         raise ValueError(f"format {declared.format[:40]!r}")
     if declared.version != version:
-        raise InputError(f"secret of version {declared.version}; this program reads version {version}")
+        raise InputError(of_other_version(declared.version, version))
     # msgspec needs the hook for the tensors of a `Similarity`.
     header = msgspec.json.decode(
         text, type=kind, dec_hook=lambda _, numbers: torch.tensor(numbers, dtype=torch.float64)

@@ -19,16 +19,17 @@ _SAMPLE = 4_000  # Gaussians that are looked at
 _SHRINK, _STEPS = 0.87, 60  # ratio of radii, and their number: down to 1/4,000
 _LEAST = 0.08  # share of the weight in the smallest sphere
 # A sphere's weight by this power of its radius: between that of lines, 1, and of clutter around a subject.
-_GROWTH = 0.8
+_GROWTH = 0.87
 _OUTLIERS = 0.995  # share of the weight of a model without surroundings that its sphere holds
 # Ratio of the sizes of Gaussians outside and inside, above which those outside are surroundings.
-_COARSER = 1.6
+_COARSER = 1.25
 _SLABS, _REACH = 40, 1.2  # slabs across 1.2 radii to both sides, which may hold a floor
-_ALIGNED = 0.85  # minimum cosine of a floor's normal with the direction across it
-_TILT, _STEP = 48.0, 5.0  # degrees from -y, as captures leave it; between directions at first
-_EXACT = 6.0  # degrees from the axes of other programs
-_TILTED_FLOOR, _AXIS_FLOOR = 0.07, 0.18  # share of the area in a floor
-_CLEARLY = 1.5  # ratio of the floor across an unusual direction to that across the usual one
+_ALIGNED = 0.7  # minimum cosine of a floor's normal with the direction across it
+# Degrees from -y, as captures leave it: the first camera looks down or up, and is hardly rolled.
+_PITCHES, _ROLLS = np.arange(-10, 56, 5), (-8, 0, 8)
+_STEP, _EXACT = 5.0, 6.0  # degrees between those directions; from the axes of other programs
+_TILTED_FLOOR, _AXIS_FLOOR = 0.095, 0.15  # share of the Gaussians, by size, in a floor
+_CLEARLY = 1.3  # ratio of the floor across an axis to that across a tilted direction
 _BELOW = 0.05  # radii by which the middle of a model is below a floor across y where y is up
 
 
@@ -46,8 +47,8 @@ def frame_of(model: Gaussians) -> Frame:
     """The dense, opaque part of a model, without coarse surroundings, faint Gaussians and outliers.
 
     The subject is the sphere with the most opacity for its size; if what lies outside is as fine, all of it.
-    Up is the normal of the largest floor among the directions near -y, where captures have it, and along z
-    and y, as other programs have it; -y without a floor.
+    Up is the normal of the largest floor below most of the model, among the directions that captures have,
+    and along z and y, as other programs have it; -y without a floor.
     """
     model = model[:: max(1, math.ceil(len(model) / _SAMPLE))].to("cpu")
     means, scales = model.means.double().numpy(), model.scales.double().numpy()
@@ -66,9 +67,9 @@ def frame_of(model: Gaussians) -> Frame:
         radius = max(_quantile(distances, weights, _OUTLIERS), 1e-6)
         inside = distances <= radius
     large = _quantile(sizes, np.ones(len(sizes)), 0.95)
-    areas = weights * np.minimum(sizes, large) ** 2 * (1 - ordered[:, 0] / ordered[:, 1].clip(1e-12))
+    extents = weights * np.minimum(sizes, large)
     normals = _normals(model.quats.double().numpy(), scales.argmin(axis=1))
-    up = _up((means[inside] - middle) / radius, normals[inside], areas[inside])
+    up = _up((means[inside] - middle) / radius, normals[inside], extents[inside])
     return Frame(middle, float(radius), up)
 
 
@@ -90,37 +91,48 @@ def _densest(means: Doubles, weights: Doubles) -> tuple[Doubles, float]:
     return sphere
 
 
-def _up(offsets: Doubles, normals: Doubles, areas: Doubles) -> Doubles:
-    """[3] the up direction; `offsets`: from the middle, in radii."""
-    total = max(float(areas.sum()), 1e-30)
+def _up(offsets: Doubles, normals: Doubles, extents: Doubles) -> Doubles:
+    """[3] the up direction; `offsets`: from the middle, in radii; `extents`: sizes, times opacities."""
+    total = max(float(extents.sum()), 1e-30)
 
-    def largest(directions: Doubles, least_above: float = -math.inf) -> tuple[float, float, Doubles]:
+    def largest(directions: Doubles, least_above: float = 0.0) -> tuple[float, float, Doubles]:
         """The largest floor across one of the directions [D, 3].
 
-        Its share of the area, how far in radii the model is above it on average, at least `least_above`, and
-        the direction.
+        Its share of the extents, how far in radii the model is above it on average, at least `least_above`,
+        and the direction.
         """
         best = (0.0, 0.0, directions[0])
         for direction, heights, cosines in zip(
             directions, directions @ offsets.T, directions @ normals.T, strict=True
         ):
             slabs = ((heights / _REACH + 1) * _SLABS / 2).astype(int).clip(0, _SLABS - 1)
-            held = np.bincount(slabs, areas * (np.abs(cosines) > _ALIGNED), _SLABS)
+            held = np.bincount(slabs, extents * (np.abs(cosines) > _ALIGNED), _SLABS)
             pairs = (held[:-1] + held[1:]) / total
             floor = int(pairs.argmax())
-            above = float(heights @ areas) / total - (2 * (floor + 1) / _SLABS - 1) * _REACH
+            above = float(heights @ extents) / total - (2 * (floor + 1) / _SLABS - 1) * _REACH
             if pairs[floor] > best[0] and above > least_above:
                 best = (float(pairs[floor]), above, direction)
         return best
 
-    down = np.array([0.0, -1.0, 0.0])
-    tilted, _, direction = largest(_cap(largest(_cap(down, _TILT, 300), 0.0)[2], _STEP, 20), 0.0)
-    level, above, _ = largest(_cap(down, _EXACT, 20))
-    if largest(_cap(np.eye(3)[2], _EXACT, 20))[0] > max(_AXIS_FLOOR, _CLEARLY * tilted):
-        return np.array([0.0, 0.0, 1.0])
+    down, z = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    tilted, _, direction = largest(_cap(largest(_of_captures())[2], _STEP, 20))
+    level, above, _ = largest(_cap(down, _EXACT, 20), -math.inf)
+    if largest(_cap(z, _EXACT, 20))[0] > max(_AXIS_FLOOR, _CLEARLY * tilted):
+        return z
     if level > _AXIS_FLOOR and level * _CLEARLY > tilted:
         return down if above > -_BELOW else -down
-    return direction if tilted > max(_TILTED_FLOOR, _CLEARLY * level) else down
+    return direction if tilted > _TILTED_FLOOR else down
+
+
+def _of_captures() -> Doubles:
+    """[D, 3] up directions in the frame of a first camera that is pitched, and hardly rolled."""
+    return np.array(
+        [
+            [math.sin(roll), -math.cos(roll) * math.cos(pitch), -math.cos(roll) * math.sin(pitch)]
+            for pitch in np.radians(_PITCHES)
+            for roll in np.radians(_ROLLS)
+        ]
+    )
 
 
 def _cap(axis: Doubles, degrees: float, count: int) -> Doubles:

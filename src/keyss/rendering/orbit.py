@@ -170,7 +170,7 @@ def is_visible(model: Gaussians) -> bool:
     """True if renders around a model show more than the background."""
     views = Viewpoints.around(model)
     background = views.background.to(model.device)
-    return any(bool((render(model, each, background) != background).any()) for each in views.cameras)
+    return any(bool((render(model, camera, background) != background).any()) for camera in views.cameras)
 
 
 def _shrink(camera: Camera) -> Camera:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -17,7 +17,7 @@ from keyss.files.file_kinds import identify_file, is_training, is_unpacked_sog, 
 from keyss.files.inputs import is_standard
 from keyss.files.ply_summary import NEARLY_TRANSPARENT, summarise_ply
 
-_BYTES_PER_GAUSSIAN = 19  # of a hidden model, at the usual precision
+_BYTES_PER_GAUSSIAN = {3: 19, 0: 12}  # of a hidden model, by SH degree, at the usual precision
 
 if TYPE_CHECKING:
     from keyss.core.gaussians import Gaussians
@@ -73,7 +73,8 @@ class SceneInfo:
 def info(path: str | Path, *, capacity: bool = False) -> RunInfo | InterruptedRun | ModelInfo | SceneInfo:
     """Describe a model ("-" for standard input), a scene folder, or a folder of results. Raises InputError.
 
-    `capacity`: also what a model can hide in each format and channel.
+    `capacity`: also what a model can hide in each format and channel; raises UsageError for folders without
+    one model.
 
     Skips photos of a scene that are missing or damaged, with a KeyssWarning.
     """
@@ -82,7 +83,7 @@ def info(path: str | Path, *, capacity: bool = False) -> RunInfo | InterruptedRu
         if not (is_standard(path) or path.exists()):
             raise InputError(f"{path}: no such file or folder")
         if path.is_dir() and not _holds_a_model(path):
-            return _folder_info(path)
+            return _folder_info(path, capacity)
         return _model_info(model_file(path), capacity)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
@@ -92,26 +93,34 @@ def _holds_a_model(folder: Path) -> bool:
     return is_unpacked_sog(folder) or is_training(folder)
 
 
-def _folder_info(path: Path) -> RunInfo | InterruptedRun | ModelInfo | SceneInfo:
+def _folder_info(path: Path, capacity: bool) -> RunInfo | InterruptedRun | ModelInfo | SceneInfo:
     from keyss.files.scenes import load_scene
     from keyss.runs.files import METRICS, MODEL, is_run, model_in
-    from keyss.runs.folder import read_manifest
+    from keyss.runs.folder import HIDE_FILES, read_manifest
     from keyss.runs.json_records import read_record
     from keyss.runs.run_records import FitMetrics, HideMetrics
 
-    if (running := read_manifest(path).running) is not None:
+    manifest = read_manifest(path)
+    if (running := manifest.running) is not None:
         steps = _steps_done(path)
         how = f"after {steps:,} training steps" if steps else "before a checkpoint was written"
         state = f"interrupted {how}: the same command with --resume continues it, --overwrite drops it"
         return InterruptedRun(f"unfinished {running.stage}", str(path), state)
     if inside := model_in(path):
         if not (path / METRICS).exists():  # hidden files have none, and `private/` may have been deleted
-            return _model_info(inside)
+            described = _model_info(inside, capacity)
+            return replace(described, kind="hiding of files") if HIDE_FILES in manifest.files else described
+        if capacity:
+            raise UsageError(f"{path}: `capacity` is of a model: give one, such as {inside}")
         if inside == path / MODEL:
             return RunInfo("plain model", str(path), read_record(path / METRICS, FitMetrics))
         return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))
     if runs := sorted(folder for folder in path.iterdir() if is_run(folder)):
-        raise InputError(f"{path} is not a run, but a folder of {len(runs)}: name one, such as {runs[0]}")
+        raise InputError(f"{path}: expected a run, found a folder of runs; give one, such as {runs[0]}")
+    if is_run(path.absolute().parent):
+        raise InputError(f"{path}: expected a run, found a folder in one; give {path.parent}")
+    if capacity:
+        raise UsageError(f"{path}: `capacity` is of a model, which `keyss fit` makes from a scene")
     scene = load_scene(path, skip_missing=True)
     sizes = Counter(f"{view.camera.width} x {view.camera.height}" for view in scene.views)
     return SceneInfo(
@@ -187,8 +196,10 @@ def _capacities(model: Gaussians) -> Iterator[str]:
         except UsageError as error:
             yield f"{flags}: nothing ({error})"
             continue
-        gaussians = room.bytes // _BYTES_PER_GAUSSIAN
-        yield f"{flags}: {room.bytes:,} bytes, a model of about {gaussians:,} Gaussians"
+        sizes = (
+            f"{room.bytes // each:,} Gaussians of SH degree {n}" for n, each in _BYTES_PER_GAUSSIAN.items()
+        )
+        yield f"{flags}: {room.bytes:,} bytes, a model of about {' or '.join(sizes)}"
     yield "--publish converted: any secret, as the file grows"
 
 

@@ -28,6 +28,7 @@ from keyss.runs.json_records import read_record, record_bytes, write_record
 PUBLISH, PRIVATE = "publish", "private"
 MANIFEST = f"{PRIVATE}/manifest.json"
 _LOCK, CHECKPOINTS, _STAGING = (f"{PRIVATE}/{name}" for name in ("lock", "checkpoint", "unfinished"))
+HIDE_FILES = "hide files"  # the stage of hidden files
 
 _MAX_SHOWN = 60  # characters of an argument in a message
 

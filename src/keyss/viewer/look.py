@@ -41,21 +41,21 @@ def look_of_scene(scene: Path) -> Look:
     """The first test photo, whole and upright; empty if the path is not a scene."""
     try:
         layout = read_layout(scene, skip_missing=True)
-        photo = sorted(layout.test or layout.train, key=lambda each: each.name)[0]
+        photo = sorted(layout.test or layout.train, key=lambda photo: photo.name)[0]
         width, height, is_white = probe_image(photo.path)
     except InputError:
         return {}
     lens = photo.lens.scale_to(width, height) or photo.lens
-    origin, _ = origin_and_extent([each.viewmat for each in layout.train])
+    origin, _ = origin_and_extent([photo.viewmat for photo in layout.train])
     shown, *cameras = (
         Camera(
-            torch.from_numpy(recentre(each.viewmat, origin)),
+            torch.from_numpy(recentre(view.viewmat, origin)),
             torch.from_numpy(lens.K),
             width,
             height,
-            each.name,
+            view.name,
         )
-        for each in (photo, *layout.train)
+        for view in (photo, *layout.train)
     )
     return {"pose": pose_of(shown, cameras), "background": "#ffffff" if is_white else "#000000"}
 
@@ -75,7 +75,7 @@ def pose_of(camera: Camera, cameras: Sequence[Camera]) -> str:
     seen = corners @ camera.viewmat[:3, :3].double() @ axes.T  # [4, 3] in the axes of the page's camera
     width, height = (seen[:, :2].abs() / seen[:, 2:].clamp_min(1e-3)).amax(0).atan().rad2deg().mul(2).tolist()
     vectors = {"eye": camera.position, "target": camera.position + depth * forward, "up": up}
-    texts = [f"{name}={','.join(f'{each:.6g}' for each in v.tolist())}" for name, v in vectors.items()]
+    texts = [f"{name}={','.join(f'{number:.6g}' for number in v.tolist())}" for name, v in vectors.items()]
     return "&".join([*texts, f"fov={min(width, _WIDEST):.4g},{min(height, _WIDEST):.4g}"])
 
 

@@ -116,8 +116,8 @@ def _page(*, policy: str, look: Look, **parts: str) -> bytes:
     shown = "".join(f' data-{name}="{html.escape(value)}"' for name, value in look.items())
     page = asset("page.html").decode().replace('<main id="main"', f'<main id="main"{shown}')
     if host := look.get("host"):
-        own = policy.split(";")[0].removeprefix("default-src ").replace("'none'", "")
-        policy = policy.replace("img-src", f"connect-src {own} {host}; img-src {host}")
+        sources = policy.split(";")[0].removeprefix("default-src ").replace("'none'", "")
+        policy = policy.replace("img-src", f"connect-src {sources} {host}; img-src {host}")
     parts["policy"] = f'<meta http-equiv="Content-Security-Policy" content="{html.escape(policy)}">'
     for name, part in parts.items():
         before, placeholder, after = page.partition(f"<!--{name}-->")

@@ -93,7 +93,7 @@ def _handler(contents: Contents, names: set[str] | None) -> type[BaseHTTPRequest
         def do_GET(self) -> None:
             # Against DNS rebinding, in which another site's name resolves to this server. Ports are ignored:
             # a tunnel has its own.
-            hosts = [re.sub(":[0-9]+$", "", each.lower()) for each in self.headers.get_all("Host", [])]
+            hosts = [re.sub(":[0-9]+$", "", host.lower()) for host in self.headers.get_all("Host", [])]
             if names is not None and (len(hosts) != 1 or hosts[0] not in names):
                 self.send_error(HTTPStatus.FORBIDDEN)
                 return

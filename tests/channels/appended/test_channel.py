@@ -228,7 +228,7 @@ def test_it_opens_from_what_gsply_writes(stego: Gaussians, tmp_path: Path) -> No
     gsply.write_spz(tmp_path / "b.spz", gsply.plyread(tmp_path / "a.ply"), version=3)
     assert unharmed(read_model(tmp_path / "b.spz")) == DATA
     gsply.plywrite(tmp_path / "c.ply", gsply.plyread(tmp_path / "a.ply"), compressed=True)
-    compressed = next(each for each in tmp_path.glob("c*") if each.suffix == ".ply")
+    compressed = next(path for path in tmp_path.glob("c*") if path.suffix == ".ply")
     assert unharmed(read_model(compressed)) == DATA
 
 

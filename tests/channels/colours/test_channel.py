@@ -85,12 +85,14 @@ def test_a_small_payload_changes_far_less_than_a_large_one(prepared: ColoursCove
     assert float((small.sh != prepared.cover.sh).any(dim=2).any(dim=1).float().mean()) < 0.6
     assert float((small.sh - prepared.cover.sh).abs().quantile(0.99)) < 0.0277
     others = [embed(prepared, [("a", bytes(20))], entropy=bytes([seed] * 32)) for seed in range(4)]
-    psnr = np.mean([psnr_between(prepared.cover, each) for each in others])  # depends on where salts are
+    psnr = np.mean([psnr_between(prepared.cover, other) for other in others])  # depends on where salts are
     assert psnr > psnr_between(prepared.cover, stego) + 3
 
 
 def _spz(model: Gaussians) -> Gaussians:
-    return next(each for each in converters() if (each.format, each.tool) == (".spz", "gsply"))(model)
+    return next(
+        converter for converter in converters() if (converter.format, converter.tool) == (".spz", "gsply")
+    )(model)
 
 
 CHANGES: dict[str, Callable[[Gaussians], Gaussians]] = {

@@ -26,7 +26,7 @@ def models(draw: st.DrawFn) -> Gaussians:
         draw(arrays.arrays(np.uint32, (count, *shape), elements=st.integers(0, 2**32 - 1)))
         for shape in (*SHAPES, ((degree + 1) ** 2, 3))
     ]
-    model = Gaussians(*(torch.from_numpy(each.view(np.float32)) for each in words))
+    model = Gaussians(*(torch.from_numpy(word.view(np.float32)) for word in words))
     if draw(st.booleans()):
         model.quats[:] = torch.tensor([0.6, 0, 0.8, 0])
     return model

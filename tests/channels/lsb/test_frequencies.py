@@ -92,7 +92,7 @@ def coincidences(codes: Any) -> dict[str, int]:
     """The numbers of small rotations, of rotations with equal parts, and of round Gaussians."""
     middle = sum(ROTATIONS[type(codes)]) / 2
     fields = in_counted_order(codes)[2]
-    parts = np.abs(np.stack([each.levels for each in fields if each.name == "rotations"], axis=1) - middle)
+    parts = np.abs(np.stack([field.levels for field in fields if field.name == "rotations"], axis=1) - middle)
     sizes = np.ptp(codes.dequantise().log_scales.numpy(), axis=1)
     return {
         "small": int((parts.max(axis=1) < 2).sum()),

@@ -83,7 +83,7 @@ def test_who_is_crowded_is_warned_for_it_can_be_seen() -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         beside = [_seen([QUARTER, THIRD, THIRD]) for _ in range(HIDINGS)]
-    assert {each.category for each in caught} == {KeyssWarning}
+    assert {warning.category for warning in caught} == {KeyssWarning}
     assert _least_chance(alone, beside) < 1e-10
     with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):
         _seen([1000] * 5)

@@ -264,7 +264,7 @@ def test_models_too_small_are_refused_with_the_number_that_would_do() -> None:
 def test_capacity_grows_with_the_model_and_is_kept_to() -> None:
     gaussians = (130, 700, 2000, 8000, 26_000, 260_000)
     capacities = [LowBitsCapacity.of(count, Layout(3)) for count in gaussians]
-    sizes = [each.for_payloads().bytes for each in capacities]
+    sizes = [capacity.for_payloads().bytes for capacity in capacities]
     assert sizes == sorted(sizes)
     assert sizes[0] == 0
     assert sizes[-1] / gaussians[-1] > 24  # a model at the finest precision

@@ -77,7 +77,7 @@ def test_what_carries_is_known_from_what_stays(suffix: str) -> None:
     """Writing over what was written leaves the places where they are."""
     codes = codes_of(suffix)
     bits = [each.bits for each in in_counted_order(codes)[2]]
-    assert sum(int(each.sum()) for each in bits) > 10 * len(codes)
+    assert sum(int(bit.sum()) for bit in bits) > 10 * len(codes)
     for round_ in range(3):
         codes = written(QuantisedCover.of(codes), b"data", entropy=bytes([round_]) * 32)
         assert all(map(np.array_equal, bits, (each.bits for each in in_counted_order(codes)[2])))
@@ -213,7 +213,7 @@ def test_the_largest_part_of_a_quaternion_stays_the_largest(suffix: str) -> None
     least, largest = ROTATIONS[type(cover.codes)]
 
     def wrong(fields: list[Field]) -> Any:
-        levels = np.stack([each.levels for each in fields if each.name == "rotations"], axis=1)
+        levels = np.stack([field.levels for field in fields if field.name == "rotations"], axis=1)
         parts = np.abs(levels - (least + largest) / 2) * 2**0.5 / (largest - least)
         rest = 1 - np.square(parts).sum(axis=1)
         return np.square(parts.max(axis=1)) > rest

@@ -37,13 +37,13 @@ def assert_close(a: Gaussians, b: Gaussians, tolerance: float = 1e-5) -> None:
 
 def same_codes(one: Codes, other: Codes) -> bool:
     """True if the codes that two files hold are equal; what else they keep of the files does not count."""
-    names = [each.name for each in fields(one) if each.name not in ("comments", "packed")]  # type: ignore[arg-type]
+    names = [field.name for field in fields(one) if field.name not in ("comments", "packed")]  # type: ignore[arg-type]
     pairs = [(np.asarray(getattr(one, name)), np.asarray(getattr(other, name))) for name in names]
     return type(one) is type(other) and all(a.dtype == b.dtype and np.array_equal(a, b) for a, b in pairs)
 
 
 def is_finite(model: Gaussians) -> bool:
-    return all(bool(getattr(model, each.name).isfinite().all()) for each in fields(model))
+    return all(bool(getattr(model, field.name).isfinite().all()) for field in fields(model))
 
 
 def random_spz(rng: np.random.Generator, version: int, count: int, k: int) -> SpzCodes:
@@ -91,7 +91,7 @@ def random_sog(rng: np.random.Generator, count: int, k: int) -> SogCodes:
 
 def random_compressed(rng: np.random.Generator, count: int, k: int) -> CompressedPlyCodes:
     def drawn(bits: list[int], kind: type) -> np.ndarray:
-        return np.stack([rng.integers(0, 2**each, count) for each in bits], axis=1).astype(kind)
+        return np.stack([rng.integers(0, 2**bit, count) for bit in bits], axis=1).astype(kind)
 
     bounds = np.sort(rng.normal(size=(-(-count // 256), 3, 2, 3)), axis=2).astype(np.float32)
     return CompressedPlyCodes(

@@ -113,7 +113,7 @@ def sog(data: bytes, rng: Random) -> bytes:
     if rng.random() < 0.1:
         meta["scales"]["codebook"] = [0] * int(rng.integers(0, 400_000))
     files["meta.json"] = json.dumps(meta).encode()
-    for name in [each for each in files if each.endswith(".webp") and rng.random() < 0.3]:
+    for name in [file for file in files if file.endswith(".webp") and rng.random() < 0.3]:
         files[name] = webp(files[name], rng)
     return _archive(files, rng)
 
@@ -146,10 +146,10 @@ def _archive(files: dict[str, bytes], rng: Random) -> bytes:
             archive.writestr("junk", b"")
             archive.filelist[-1].compress_size = claim(rng)
         shared = archive.getinfo(str(rng.choice(archive.namelist())))
-        for each in archive.filelist:
+        for entry in archive.filelist:
             for field in ("compress_size", "file_size", "header_offset"):
                 if rng.random() < 0.05:
-                    setattr(each, field, claim(rng))
+                    setattr(entry, field, claim(rng))
         for number in range(int(rng.choice([0, 1, 51, 2000], p=[0.6, 0.3, 0.09, 0.01]))):
             again = zipfile.ZipInfo(f"{number}" if number else "means_u.webp")
             for field in ("compress_type", "compress_size", "file_size", "CRC", "header_offset"):

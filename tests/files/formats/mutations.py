@@ -43,7 +43,7 @@ from tiny_scenes import random_gaussians
 SECONDS = 2.0  # time limit for a file of a few kilobytes
 CARRIERS = 6000  # Gaussians of the published model that holds a payload
 MEMORY, PER_BYTE = 200 << 20, 32  # memory limit for reading a file: bytes, and bytes per byte of the file
-MODELS = tuple(f"a{suffix}" for each in FORMATS for suffix in each.suffixes)
+MODELS = tuple(f"a{suffix}" for model_format in FORMATS for suffix in model_format.suffixes)
 NAMES = (
     *MODELS,
     *("a.payload", "a.3dgs.safetensors", "a.tensors", "a.png"),
@@ -205,7 +205,7 @@ def main() -> int:
     asked = parser.parse_args()
     files = [(name, data) for name, every in examples().items() for data in every]
     if asked.only or asked.false_sizes:
-        files = [each for each in files if each[0] in ([asked.only] if asked.only else FALSE_SIZES)]
+        files = [file for file in files if file[0] in ([asked.only] if asked.only else FALSE_SIZES)]
     for name, data in files:
         assert attempt(name, data) is None, (name, attempt(name, data))
     failures, start = 0, time.perf_counter()

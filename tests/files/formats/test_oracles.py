@@ -106,7 +106,7 @@ def of_gsply(data: gsply.GSData, *, turned: bool = False) -> Gaussians:
     rest = np.empty((n, 0, 3), np.float32) if data.shN is None else data.shN.reshape(n, -1, 3)
     sh = np.concatenate([data.sh0[:, None], rest], axis=1)
     arrays = (data.means, data.quats, data.scales, data.opacities, sh)
-    model = Gaussians(*(torch.from_numpy(np.ascontiguousarray(each, np.float32)) for each in arrays))
+    model = Gaussians(*(torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in arrays))
     return rotate(model) if turned else model
 
 

@@ -53,7 +53,7 @@ def audited_run(root: Path) -> None:
 
 
 def _few_changes() -> list[Change]:
-    sog = next(each for each in converters() if each.format == ".sog")
+    sog = next(converter for converter in converters() if converter.format == ".sog")
     return [
         random_pruning(0.1),
         *(random_pruning(0.25, draw) for draw in range(3)),

@@ -63,7 +63,7 @@ def test_comparison_and_resume(
     assert numbers["3dgs"]["cover.psnr"] >= numbers["3dgs-sh"]["cover.psnr"] - 1
     assert 1e6 * numbers["3dgs-sh"]["files.companion_mb"] > numbers["3dgs-sh"]["gaussians"] * 16 * 3 * 4
     assert [rows[name]["keys"] for name in names.split(",")] == [False, False, True]
-    assert {(each["steps.1"], each["steps.2"]) for each in numbers.values()} == {(60, 60)}
+    assert {(number["steps.1"], number["steps.2"]) for number in numbers.values()} == {(60, 60)}
     # The companion files belong to every row, and those of `3dgs` have other places.
     assert "survival.pruned, cover" in numbers["3dgs-sh"]
     assert "survival.pruned, secret" not in numbers["3dgs-sh"]
@@ -124,6 +124,9 @@ def test_default_budget_and_lock(folders: tuple[Path, Path], tmp_path: Path) -> 
     """The default budget is that of the first method's preset."""
     found = compare(*folders, methods=["carry:quick", "3dgs"], out=tmp_path / "out", dry_run=True)
     assert isinstance(found, Forecast)
-    assert {each.partition(", ")[2] for each in found.names.values()} >= {"500 steps, seed 0"}
+    assert {name.partition(", ")[2] for name in found.names.values()} >= {
+        "500 steps, 10,000 Gaussians, seed 0"
+    }
+    assert len({*found.names.values()}) == len(found.names)
     with claim_folder(tmp_path / "out"), pytest.raises(OutputError, match="another process"):
         compare(*folders, methods=["carry:quick"], out=tmp_path / "out")

@@ -90,7 +90,7 @@ def test_failed_trials(
     monkeypatch.setattr(trial, "hide", failing)
     found = run("speed", folders, out)
     assert found.failures == {f"{name}, a-b": "not today" for name in ("3DGS", "GS-Hider", "WaterGS")}
-    verdicts = [each.verdict for each in found.claims]
+    verdicts = [claim.verdict for claim in found.claims]
     assert verdicts[0] in ("holds", "holds in part", "does not hold here")  # from the first run
     assert verdicts[1] == "not measured"
     said = keyss("reproduce", "speed", *folders, *FLAGS, "-o", out)
@@ -107,7 +107,7 @@ def test_command(keyss: Run, out: Path, folders: tuple[Path, Path], tmp_path: Pa
     assert planned.status == 0, planned.err
     assert not (tmp_path / "new").exists()
     assert [line.split("  ")[0] for line in planned.out.splitlines()[1:6]] == [
-        *(f"plain model of {scene}, 20 steps, seed 5" for scene in "ab"),
+        *(f"plain model of {scene}, 20 steps, 150 Gaussians, seed 5" for scene in "ab"),
         *(f"{mask}, a-b" for mask in ("op", "op,ro", "op,ro,sc,xyz")),
     ]
     assert "5 to do" in planned.out

@@ -173,7 +173,7 @@ def test_dry_run(keyss: Run, tmp_path: Path) -> None:
     found = sweep(spec, out, dry_run=True)
     assert isinstance(found, Forecast)
     assert len(found.names) == len(found.costs) == 2
-    assert all(each.seconds > 0 and each.memory_bytes > 10**8 for each in found.costs.values())
+    assert all(cost.seconds > 0 and cost.memory_bytes > 10**8 for cost in found.costs.values())
     said = keyss("sweep", spec, "-o", out, "--dry-run")
     assert said.status == 0, said
     assert "2 runs, 2 to do: about " in said.out

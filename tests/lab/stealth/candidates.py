@@ -74,7 +74,7 @@ def _energies(model: Gaussians) -> Doubles:
         model.sh[:, band**2 : (band + 1) ** 2].detach().cpu().double().square().sum(1)
         for band in range(1, model.sh_degree + 1)
     ]
-    return np.log(np.concatenate([each.numpy() for each in columns], axis=1) + 1e-12)
+    return np.log(np.concatenate([column.numpy() for column in columns], axis=1) + 1e-12)
 
 
 def _by_rows(own: Doubles, theirs: Doubles) -> dict[str, float]:

@@ -63,13 +63,17 @@ def test_carried_secrets_are_not_confirmed() -> None:
     candidates = [plain(10 + index, 700) for index in range(SECRETS)]
     covers = [plain(index) for index in range(SECRETS)]
     before = [
-        candidate_scores(cover, each)["nearness of rows, median"] for cover in covers for each in candidates
+        candidate_scores(cover, candidate)["nearness of rows, median"]
+        for cover in covers
+        for candidate in candidates
     ]
     files = [
         embed_derived(cover, [(keys(index), secret)], os.urandom(32))
         for index, (cover, secret) in enumerate(zip(covers, candidates, strict=True))
     ]
     after = [
-        candidate_scores(file, each)["nearness of rows, median"] for file in files for each in candidates
+        candidate_scores(file, candidate)["nearness of rows, median"]
+        for file in files
+        for candidate in candidates
     ]
     assert after == pytest.approx(before, abs=1e-2)

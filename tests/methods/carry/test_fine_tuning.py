@@ -12,7 +12,7 @@ import keyss
 from channels.lsb.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.channels import gaussian_ids
-from keyss.core import Gaussians, KeyssWarning, Scene
+from keyss.core import Gaussians, KeyssWarning, Scene, UsageError
 from keyss.methods import Prepared, Source, Training, most_contributing, registry
 from methods.hiding import check_resumes, hide_scenes, psnr_in, three_scenes
 from tiny_scenes import random_gaussians, tiny_scene
@@ -54,7 +54,9 @@ def test_fine_tuning_steps() -> None:
     assert _steps(options, _source(cover), _source(large)) == [400]
     assert _steps(options, _source(cover), _source(large, photos=True)) == [1150]
     assert _steps(options, _source(cover), _source(small), _source(large)) == [0, 400]
+    assert [fit.iterations for fit in options.fits(3)] == [1000, 2150, 2150]  # those of fine-tuning, too
     asked = options.with_fit(iterations=900)
+    assert [fit.iterations for fit in asked.fits(3)] == [900] * 3
     assert _steps(asked, _source(cover), _source(large)) == [900]
     result = keyss.hide(
         cover,
@@ -65,6 +67,16 @@ def test_fine_tuning_steps() -> None:
     )
     assert result.metrics.iterations == 2
     assert (len(keyss.reveal(result.stego, KEY).gaussians),) == result.metrics.secret_gaussians
+
+
+@pytest.mark.parametrize("photos", [False, True])
+def test_hopeless_secrets_are_refused_before_training(photos: bool) -> None:
+    """Colours hold about a bit per Gaussian of the cover; nothing is fitted or fine-tuned for them."""
+    model = trained_like(4000)
+    sources = [Source(None if photos else each, photos) for each in (model, trained_like(4000, 1))]
+    colours = CarryOptions(fit=FIT, publish="converted", channel="colours")
+    with pytest.raises(UsageError, match=r"4,000 Gaussians would be cut down to about \d\d; `channel="):
+        _prepare(colours, *sources)
 
 
 def test_shared_capacity_warns() -> None:

@@ -70,7 +70,7 @@ def test_round_trip() -> None:
 
 
 def test_unknown_version() -> None:
-    with pytest.raises(InputError, match=r"version 1.*version 11"):
+    with pytest.raises(InputError, match=r"version 1.*version 11: open it with the keyss that wrote it"):
         _unpack(_with_header(version=1))
 
 

@@ -58,7 +58,7 @@ def test_equation_11(design: str, weight: float) -> None:
     expected = 0.7 * parts[0] + 0.3 * (parts[1] + parts[2]) + 0.2 * _loss(wrong, targets[0], weight)
     total, renders = run.losses([pose] * 3, VECTORS[2])
     torch.testing.assert_close(total, expected, rtol=1e-4, atol=1e-5)
-    assert [each[2] for each in renders] == ([1.0] * 3 if design == "released" else [0.7, 0.3, 0.3])
+    assert [render[2] for render in renders] == ([1.0] * 3 if design == "released" else [0.7, 0.3, 0.3])
 
 
 def test_reveal_in_cover_frame(hidden: Hidden) -> None:
@@ -156,7 +156,7 @@ def test_each_scene_has_its_own_photos_between_common_poses() -> None:
 def test_start_leaves_room_for_growth() -> None:
     scenes = [tiny_scene(seed) for seed in range(3)]
     run = _run()
-    assert run.started == len(run) == min(FIT.max_gaussians // 3, sum(len(each.points) for each in scenes))
+    assert run.started == len(run) == min(FIT.max_gaussians // 3, sum(len(scene.points) for scene in scenes))
     # As wide as the distance to neighbours of any scene (combined SfM points).
     means, widths = run.parameters["means"].detach(), run.parameters["scales"].detach().exp()[:, 0]
     nearest = torch.cdist(means, means).topk(4, largest=False).values[:, 1:]

@@ -7,15 +7,16 @@ const SAMPLE = 4_000; // Gaussians that are looked at
 const [SHRINK, STEPS] = [0.87, 60]; // ratio of radii, and their number: down to 1/4,000
 const LEAST = 0.08; // share of the weight in the smallest sphere
 // A sphere's weight by this power of its radius: between that of lines, 1, and of clutter around a subject.
-const GROWTH = 0.8;
+const GROWTH = 0.87;
 const OUTLIERS = 0.995; // share of the weight of a model without surroundings that its sphere holds
-const COARSER = 1.6; // ratio of the sizes of Gaussians outside and inside, above which those outside are surroundings
+const COARSER = 1.25; // ratio of the sizes of Gaussians outside and inside, above which those outside are surroundings
 const [SLABS, REACH] = [40, 1.2]; // slabs across 1.2 radii to both sides, which may hold a floor
-const ALIGNED = 0.85; // minimum cosine of a floor's normal with the direction across it
-const [TILT, STEP] = [48, 5]; // degrees from -y, as captures leave it; between directions at first
-const EXACT = 6; // degrees from the axes of other programs
-const [TILTED_FLOOR, AXIS_FLOOR] = [0.07, 0.18]; // share of the area in a floor
-const CLEARLY = 1.5; // ratio of the floor across an unusual direction to that across the usual one
+const ALIGNED = 0.7; // minimum cosine of a floor's normal with the direction across it
+// Degrees from -y, as captures leave it: the first camera looks down or up, and is hardly rolled.
+const [LOWEST, HIGHEST, ROLLS] = [-10, 55, [-8, 0, 8]];
+const [STEP, EXACT] = [5, 6]; // degrees between those directions; from the axes of other programs
+const [TILTED_FLOOR, AXIS_FLOOR] = [0.095, 0.15]; // share of the Gaussians, by size, in a floor
+const CLEARLY = 1.3; // ratio of the floor across an axis to that across a tilted direction
 const BELOW = 0.05; // radii by which the middle of a model is below a floor across y where y is up
 
 /** Gaussians of a model, sampled. */
@@ -37,8 +38,8 @@ export interface Frame {
  * The dense, opaque part of a model, without coarse surroundings, faint Gaussians and outliers.
  *
  * The subject is the sphere with the most opacity for its size; if what lies outside is as fine, all of it. Up is the
- * normal of the largest floor among the directions near -y, where captures have it, and along z and y, as other programs
- * have it; -y without a floor.
+ * normal of the largest floor below most of the model, among the directions that captures have, and along z and y, as
+ * other programs have it; -y without a floor.
  */
 export function frameOf(model: Gaussians): Frame {
   const step = Math.max(1, Math.ceil(model.count / SAMPLE));
@@ -60,12 +61,11 @@ export function frameOf(model: Gaussians): Frame {
     inside = means.flatMap((_, at) => (distances[at] <= radius ? [at] : []));
   }
   const large = quantile(sizes, sizes.map(() => 1), 0.95);
-  const areas = sizes.map((size, at) =>
-    weights[at] * Math.min(size, large) ** 2 * (1 - ordered[at][0] / Math.max(ordered[at][1], 1e-12)));
+  const extents = sizes.map((size, at) => weights[at] * Math.min(size, large));
   const floors = new Floors(
     inside.map((at) => means[at].map((each, axis) => (each - middle[axis]) / radius) as unknown as Vector),
     inside.map((at) => normal(model, rows[at])),
-    inside.map((at) => areas[at]),
+    inside.map((at) => extents[at]),
   );
   return { middle, radius, up: floors.up(), sample: { means, weights, sizes } };
 }
@@ -88,39 +88,39 @@ function densest(means: readonly Vector[], weights: readonly number[]): { middle
   return found;
 }
 
-/** Gaussians that may lie in a floor: offsets from the middle in radii, normals, and areas. */
+/** Gaussians that may lie in a floor: offsets from the middle in radii, normals, and sizes, times opacities. */
 class Floors {
   constructor(
     private readonly offsets: readonly Vector[], private readonly normals: readonly Vector[],
-    private readonly areas: readonly number[],
+    private readonly extents: readonly number[],
   ) {}
 
   up(): Vector {
     const [down, z] = [[0, -1, 0], [0, 0, 1]] as Vector[];
-    const tilted = this.largest(cap(this.largest(cap(down, TILT, 300), 0).direction, STEP, 20), 0);
-    const level = this.largest(cap(down, EXACT, 20));
+    const tilted = this.largest(cap(this.largest(ofCaptures()).direction, STEP, 20));
+    const level = this.largest(cap(down, EXACT, 20), -Infinity);
     if (this.largest(cap(z, EXACT, 20)).share > Math.max(AXIS_FLOOR, CLEARLY * tilted.share)) return z;
     if (level.share > AXIS_FLOOR && level.share * CLEARLY > tilted.share) return level.above > -BELOW ? down : [0, 1, 0];
-    return tilted.share > Math.max(TILTED_FLOOR, CLEARLY * level.share) ? tilted.direction : down;
+    return tilted.share > TILTED_FLOOR ? tilted.direction : down;
   }
 
   /**
-   * The largest floor across one of the directions: its share of the area, how far in radii the model is above it on
+   * The largest floor across one of the directions: its share of the extents, how far in radii the model is above it on
    * average, at least `leastAbove`, and the direction.
    */
-  private largest(directions: readonly Vector[], leastAbove = -Infinity): Floor {
-    const total = Math.max(sum(this.areas), 1e-30);
+  private largest(directions: readonly Vector[], leastAbove = 0): Floor {
+    const total = Math.max(sum(this.extents), 1e-30);
     let best: Floor = { share: 0, above: 0, direction: directions[0] };
     for (const direction of directions) {
       const [x, y, z] = direction;
       const slabs = new Float64Array(SLABS);
       let middle = 0;
-      for (let at = 0; at < this.areas.length; at++) {
+      for (let at = 0; at < this.extents.length; at++) {
         const [offset, normal] = [this.offsets[at], this.normals[at]];
         const height = x * offset[0] + y * offset[1] + z * offset[2];
-        middle += height * this.areas[at];
+        middle += height * this.extents[at];
         if (Math.abs(x * normal[0] + y * normal[1] + z * normal[2]) <= ALIGNED) continue;
-        slabs[Math.max(0, Math.min(SLABS - 1, Math.trunc(((height / REACH + 1) * SLABS) / 2)))] += this.areas[at];
+        slabs[Math.max(0, Math.min(SLABS - 1, Math.trunc(((height / REACH + 1) * SLABS) / 2)))] += this.extents[at];
       }
       const pairs = slabs.slice(1).map((area, at) => area + slabs[at]);
       const floor = pairs.indexOf(Math.max(...pairs));
@@ -136,6 +136,18 @@ interface Floor {
   readonly share: number;
   readonly above: number;
   readonly direction: Vector;
+}
+
+/** Up directions in the frame of a first camera that is pitched, and hardly rolled. */
+function ofCaptures(): Vector[] {
+  const directions: Vector[] = [];
+  for (let pitch = LOWEST; pitch <= HIGHEST; pitch += STEP) {
+    for (const roll of ROLLS) {
+      const [p, r] = [(pitch * Math.PI) / 180, (roll * Math.PI) / 180];
+      directions.push([Math.sin(r), -Math.cos(r) * Math.cos(p), -Math.cos(r) * Math.sin(p)]);
+    }
+  }
+  return directions;
 }
 
 /** Directions within `degrees` of an axis other than x, which is the first, evenly spread. */

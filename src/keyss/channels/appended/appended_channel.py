@@ -150,13 +150,13 @@ class AppendedReader(SaltedReader):
             best: tuple[pilots.PilotFit, Integers] | None = None
             for shift in shifts:
                 scales = scales_at(steps, shift)
-                found = pilots.read(invariants_of(colours, scales), faint.means.double().numpy())
-                if found and (best is None or found.inliers > best[0].inliers):
-                    best = found, scales
+                pilot_frame = pilots.read(invariants_of(colours, scales), faint.means.double().numpy())
+                if pilot_frame and (best is None or pilot_frame.inliers > best[0].inliers):
+                    best = pilot_frame, scales
             if best is not None:
-                found, scales = best
-                words = pack_words(colours, scales, *points_in_frame(faint, found.to_own))
-                return AppendedReader([found.salt], words, model.detach().to("cpu"), found.to_own)
+                pilot_frame, scales = best
+                words = pack_words(colours, scales, *points_in_frame(faint, pilot_frame.to_own))
+                return AppendedReader([pilot_frame.salt], words, model.detach().to("cpu"), pilot_frame.to_own)
         return None
 
     def extract(self, key: DerivedKey) -> Payload:
@@ -182,7 +182,7 @@ def _bucket(size: int) -> int:
 
 def _padded_count(every: Sequence[Codewords]) -> int:
     """The number of Gaussians to append for payloads in these codewords: one of few, which reveal little."""
-    used = sum(HEADERS + each.shards for each in every)
+    used = sum(HEADERS + layout.shards for layout in every)
     total = _bucket(used)
     while total - pilots.count_for(total) < used:
         total = _bucket(total + 1)
@@ -210,7 +210,7 @@ def _codewords(needed: int, width: int) -> Codewords:
 def _shifts_with_pilots(steps: Doubles, colours: Integers) -> Iterator[float]:
     """Offsets of the lattice of log scales with significantly many pilots, most first."""
     shifts = all_shifts(steps)
-    counts = np.array([pilots.count(invariants_of(colours, scales_at(steps, each))) for each in shifts])
+    counts = np.array([pilots.count(invariants_of(colours, scales_at(steps, shift))) for shift in shifts])
     expected = len(steps) / pilots.ONE_IN
     for index in np.argsort(counts)[::-1][:_MAX_OFFSETS]:
         if counts[index] > expected + _SIGNIFICANT * math.sqrt(expected):

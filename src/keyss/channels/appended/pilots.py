@@ -56,21 +56,21 @@ def write(salt: bytes, count: int, random: np.random.Generator) -> Bits:
     """Words [count, WORD_BITS] of pilots."""
     parts = np.frombuffer(salt, ">u2").astype(np.uint64)
     which = np.arange(count) % _PARTS
-    found = np.zeros(count, np.uint64)
+    pilots = np.zeros(count, np.uint64)
     missing = np.arange(count)
     while len(missing):
         scales = random.integers(0, 1 << 3 * SCALE_BITS, len(missing), np.uint64)
         filling = random.integers(0, 1 << _RANDOM_BITS, len(missing), np.uint64)
-        own = which[missing].astype(np.uint64) << np.uint64(_PART_BITS) | parts[which[missing]]
-        colours = (own << np.uint64(_RANDOM_BITS) | filling) ^ _whitening(scales)
+        values = which[missing].astype(np.uint64) << np.uint64(_PART_BITS) | parts[which[missing]]
+        colours = (values << np.uint64(_RANDOM_BITS) | filling) ^ _whitening(scales)
         invariants = colours << np.uint64(3 * SCALE_BITS) | scales
         good = _is_pilot(invariants)
-        found[missing[good]] = invariants[good]
+        pilots[missing[good]] = invariants[good]
         missing = missing[~good]
-    places = mix(mix(found ^ _PUBLIC))
+    places = mix(mix(pilots ^ _PUBLIC))
     width = 3 * (POSITION_BITS + ROTATION_BITS)
     others = bits_of(places >> np.uint64(64 - width), width)
-    return np.concatenate([bits_of(found, INVARIANT_BITS), others], axis=1)
+    return np.concatenate([bits_of(pilots, INVARIANT_BITS), others], axis=1)
 
 
 def count(invariants: Words) -> int:
@@ -84,15 +84,15 @@ def read(invariants: Words, means: Doubles) -> PilotFit | None:
     None if too few agree.
     """
     random = np.random.default_rng(0)
-    own = _pilots(invariants)
-    if len(own) < _MIN_INLIERS:
+    pilots = _pilots(invariants)
+    if len(pilots) < _MIN_INLIERS:
         return None
-    places = mix(mix(invariants[own] ^ _PUBLIC))
+    places = mix(mix(invariants[pilots] ^ _PUBLIC))
     shifts = np.uint64(64) - np.arange(1, 4, dtype=np.uint64) * np.uint64(POSITION_BITS)
     points = places[:, None] >> shifts & np.uint64(2**POSITION_BITS - 1)
     expected = (points.astype(np.float64) + 0.5) / 2**POSITION_BITS
-    world = means[own]
-    some = np.arange(min(len(own), _SAMPLE)) * len(own) // min(len(own), _SAMPLE)
+    world = means[pilots]
+    some = np.arange(min(len(pilots), _SAMPLE)) * len(pilots) // min(len(pilots), _SAMPLE)
     triples = some[random.integers(0, len(some), (_TRIES, 3))]
     inliers = _inliers(world, expected, triples, some)
     best = some[inliers[inliers.sum(axis=1).argmax()]]
@@ -103,7 +103,7 @@ def read(invariants: Words, means: Doubles) -> PilotFit | None:
     if len(best) < _MIN_INLIERS:
         return None
     scale, rotation, translation = _similarities(world[best], expected[best])
-    salt = _salt(invariants[own[best]])
+    salt = _salt(invariants[pilots[best]])
     if salt is None:
         return None
     to_own = Similarity(float(scale), torch.from_numpy(rotation), torch.from_numpy(translation))
@@ -148,17 +148,17 @@ def _salt(invariants: Words) -> bytes | None:
     scales = invariants & np.uint64((1 << 3 * SCALE_BITS) - 1)
     parts = (invariants >> np.uint64(3 * SCALE_BITS) ^ _whitening(scales)) >> np.uint64(_RANDOM_BITS)
     votes = [Counter[int]() for _ in range(_PARTS)]
-    for each in parts.tolist():
-        votes[each >> _PART_BITS][each & (1 << _PART_BITS) - 1] += 1
+    for part in parts.tolist():
+        votes[part >> _PART_BITS][part & (1 << _PART_BITS) - 1] += 1
     if not all(votes):
         return None
-    return b"".join(each.most_common(1)[0][0].to_bytes(2, "big") for each in votes)
+    return b"".join(counter.most_common(1)[0][0].to_bytes(2, "big") for counter in votes)
 
 
 def _pilots(invariants: Words) -> Integers:
     """Rows of different pilots; copies of one faint Gaussian would outnumber the others."""
-    found = np.flatnonzero(_is_pilot(invariants))
-    return found[np.sort(np.unique(invariants[found], return_index=True)[1])]
+    places = np.flatnonzero(_is_pilot(invariants))
+    return places[np.sort(np.unique(invariants[places], return_index=True)[1])]
 
 
 def _is_pilot(invariants: Words) -> Flags:

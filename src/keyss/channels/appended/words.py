@@ -52,10 +52,10 @@ _MIN_VOTES = 12  # headers; fewer can agree by chance among a million words
 def candidate_mask(model: Gaussians) -> Flags:
     """Mask [N] of finite Gaussians as faint as appended ones."""
     opacities = model.opacities.detach().cpu().numpy()
-    found: Flags = (opacities > _FAINTEST) & (opacities < _STRONGEST)
+    faint: Flags = (opacities > _FAINTEST) & (opacities < _STRONGEST)
     for values in (model.means, model.quats, model.log_scales, model.sh):
-        found &= np.isfinite(values.detach().cpu().numpy()).reshape(len(found), -1).all(axis=1)
-    return found
+        faint &= np.isfinite(values.detach().cpu().numpy()).reshape(len(faint), -1).all(axis=1)
+    return faint
 
 
 def is_appended(model: Gaussians) -> Tensor:
@@ -112,8 +112,8 @@ def to_gaussians(words: Bits, to_world: Similarity, sh_degree: int) -> Gaussians
     sh[:, 0] = colours
     logits = np.full(len(words), _LOGIT)
     numbers = (positions, np.concatenate([w, parts], axis=1), scales, logits, sh)
-    own = Gaussians(*(torch.from_numpy(each).float() for each in numbers))
-    return to_world.apply_gaussians(own)
+    model = Gaussians(*(torch.from_numpy(column).float() for column in numbers))
+    return to_world.apply_gaussians(model)
 
 
 def colours_of(model: Gaussians) -> Integers:
@@ -139,10 +139,10 @@ def likely_shifts(steps: Doubles) -> list[float]:
     """
     phase = float(np.angle(np.exp(2j * np.pi * steps).mean())) / (2 * np.pi)
     whole = np.rint(steps - phase).clip(-_FARTHEST, _FARTHEST).astype(np.int64)
-    found = np.bincount((whole + _FARTHEST).ravel(), minlength=2 * _FARTHEST)
-    inside = np.convolve(found, np.ones(2**SCALE_BITS, np.int64))  # at i: scales on a lattice that ends at i
+    counts = np.bincount((whole + _FARTHEST).ravel(), minlength=2 * _FARTHEST)
+    inside = np.convolve(counts, np.ones(2**SCALE_BITS, np.int64))  # at i: scales on a lattice that ends at i
     best = int(inside.argmax()) - 2**SCALE_BITS + 1 - _FARTHEST
-    return [best + phase + each for each in (0, 1, -1, 2, -2)]
+    return [best + phase + offset for offset in (0, 1, -1, 2, -2)]
 
 
 def all_shifts(steps: Doubles) -> Doubles:
@@ -164,7 +164,7 @@ def points_in_frame(model: Gaussians, to_own: Similarity) -> tuple[Integers, Int
 def pack_words(*fields: Integers) -> Bits:
     """Words [N, WORD_BITS] from colours, scales, positions and rotations, [N, 3] each."""
     both = zip(fields, _WIDTHS, strict=True)
-    bits = [bits_of(column.astype(np.uint64), width) for each, width in both for column in each.T]
+    bits = [bits_of(column.astype(np.uint64), width) for columns, width in both for column in columns.T]
     return np.concatenate(bits, axis=1)
 
 

@@ -96,43 +96,41 @@ class ColoursCover:
         if len(salts) < SALTS:
             raise UsageError(_TOO_FEW)
         secrets = [Secrets.of(key, salts) for key, _ in payloads]
-        container.check_keys([each.static for each in secrets])
+        container.check_keys([secret.static for secret in secrets])
         sizes = list(map(container.sealed_size, contents))
-        found = self.planner.layouts(sizes)
-        if found is None:
+        plan = self.planner.layouts(sizes)
+        if plan is None:
             raise UsageError(
                 f"the colours of this cover hold {self.planner.bytes:,} bytes of one secret, and less of "
                 f"several; the given take {sum(sizes) - OVERHEAD * len(sizes):,}"
             )
-        layouts, reveals_others = found
+        layouts, reveals_others = plan
         if reveals_others:
             container.warn_of_others()
         # Headers without a secret hide the number of secrets. Above level ONE, others are noticed anyway.
         for index in range(len(secrets), MIN_HEADERS if layouts[0].level == ONE else 0):
-            labels = [f"colours/nobody/{index}/{each}" for each in range(SALTS + 1)]
+            labels = [f"colours/nobody/{index}/{salt}" for salt in range(SALTS + 1)]
             static, *salted = (expand(secret, label, MASTER_BYTES) for label in labels)
             secrets.append(Secrets(static, tuple(salted)))
         free = np.zeros(len(carriers), bool)
         free[self.planner.writable] = True
         free[salt_rows] = False
         file_key = expand(secret, "colours/file-key", FILE_KEY_BYTES)
-        headers = self._headers(layouts, sizes, file_key, carriers, _without_places(free, secrets, carriers))
+        headers = self._headers(layouts, sizes, file_key, _without_places(free, secrets, carriers))
         for lower in range(_LOWER + 1):  # the plan does not include the cost of headers and salts
-            lowered = [replace(each, level=each.level and max(1, each.level - lower)) for each in headers]
-            stego = self._write(secrets, lowered, layouts, contents, carriers, free, random)
+            lowered = [
+                replace(header, level=header.level and max(1, header.level - lower)) for header in headers
+            ]
+            stego = self._write(secrets, lowered, layouts, contents, free, random)
             if layouts[0].level == ONE or not self.planner.is_visible(stego):
                 break
         return stego
 
     def _headers(
-        self,
-        layouts: Sequence[Layout],
-        sizes: Sequence[int],
-        file_key: bytes,
-        carriers: Carriers,
-        holds: Flags,
+        self, layouts: Sequence[Layout], sizes: Sequence[int], file_key: bytes, holds: Flags
     ) -> list[Header]:
         """The header of each payload; `holds` [C]: mask of the carriers that may hold payloads."""
+        carriers = self.planner.carriers
         headers, first, middle = [], 0, round(median(carriers)) % 256
         for layout, size in zip(layouts, sizes, strict=True):
             last = min(first + max(1, math.ceil(SHARES * layout.share)), SHARES) - 1
@@ -150,7 +148,6 @@ class ColoursCover:
         headers: Sequence[Header],
         layouts: Sequence[Layout],
         payloads: Sequence[Payload],
-        carriers: Carriers,
         free: Flags,
         random: np.random.Generator,
     ) -> Gaussians:
@@ -159,16 +156,17 @@ class ColoursCover:
         `free` [C]: mask of carriers that may be written. Only likely values are written for payloads whose
         layout says so, and for their headers if these may skip values.
         """
+        carriers = self.planner.carriers
         free, values, chosen = free.copy(), carriers.colours[:, 1:].copy(), np.zeros(len(carriers), bool)
         for salt in range(SALTS):  # alternate between secrets, because later headers find fewer free places
-            for index, each in enumerate(secrets):
+            for index, secret in enumerate(secrets):
                 like = min(index, len(headers) - 1)  # headers without a secret resemble the last one
-                rows, new = headers[like].write(each, salt, carriers)
+                rows, new = headers[like].write(secret, salt, carriers)
                 rows, new = rows[free[rows]], new[free[rows]]
                 values[rows], free[rows] = new, False
                 chosen[rows] = layouts[like].likely and self.planner.headers_may_skip
-        for each, header, layout, payload in zip(secrets, headers, layouts, payloads, strict=False):
-            rows, key = np.flatnonzero(free & header.carrier_mask(carriers)), each.data_key(header)
+        for secret, header, layout, payload in zip(secrets, headers, layouts, payloads, strict=False):
+            rows, key = np.flatnonzero(free & header.carrier_mask(carriers)), secret.data_key(header)
             sealed = container.seal(key, payload, bucket_bytes(header.bucket))
             ids, bits = carriers.ids[rows], bit_counts(carriers.impact[rows], header.level)
             data = np.unpackbits(np.frombuffer(sealed, np.uint8))
@@ -176,7 +174,7 @@ class ColoursCover:
             values[rows], chosen[rows] = write(key, ids, values[rows], bits, code), layout.likely
         new = self.planner.statistics.imitate(values)
         if chosen.any():
-            base = np.where(chosen[:, None], self.planner.carriers.colours, new)
+            base = np.where(chosen[:, None], carriers.colours, new)
             accepted = self.planner.likelihood.accept(base, new, random)
             new[:, 1:] = np.where(accepted, new[:, 1:], base[:, 1:])
         sh = self.cover.sh.detach().clone()
@@ -192,7 +190,9 @@ class ColoursReader:
 
     @staticmethod
     def of(model: Gaussians) -> ColoursReader:
-        return ColoursReader(tuple(Carriers.of(model, each / _ALIGNMENTS) for each in range(_ALIGNMENTS)))
+        return ColoursReader(
+            tuple(Carriers.of(model, alignment / _ALIGNMENTS) for alignment in range(_ALIGNMENTS))
+        )
 
     def open(self, key: str) -> Payload:
         """See `SaltedReader`.
@@ -229,12 +229,12 @@ def _payload(header: Header, secrets: Secrets, carriers: Carriers, shift: float)
         return None
     sure = (1 - header.idle * IDLE) * (1 - _CHANGED) * carriers.certainty[rows]
     values, words = read(key, ids, carriers.colours[rows, 1:], bits), seeds(key, "seeds", ids, bits)
-    found = Fountain(8 * size).decode(words, np.repeat(sure, COLUMNS * bits) * values)
+    decoded = Fountain(8 * size).decode(words, np.repeat(sure, COLUMNS * bits) * values)
     try:
-        payload = container.unseal(key, np.packbits(found).tobytes())[1]
+        payload = container.unseal(key, np.packbits(decoded).tobytes())[1]
     except InputError:
         return None
-    agreement = values * (1 - 2.0 * Fountain(8 * size).encode(found, words))
+    agreement = values * (1 - 2.0 * Fountain(8 * size).encode(decoded, words))
     held = np.repeat((1 - header.idle * IDLE) * carriers.stability[rows], COLUMNS * bits)
     weights = np.repeat(carriers.weights[rows], COLUMNS * bits)
     share = _foreign_share(agreement, held, weights)
@@ -256,7 +256,7 @@ def _foreign_share(agreement: Doubles, held: Doubles, weights: Doubles) -> float
 def _without_places(mask: Flags, secrets: Sequence[Secrets], carriers: Carriers) -> Flags:
     """`mask` [C] without the places of these secrets' headers."""
     left = mask.copy()
-    for each in secrets:
-        for secret in each.salted:
+    for keyed in secrets:
+        for secret in keyed.salted:
             left[places(secret, carriers)[0]] = False
     return left

@@ -104,8 +104,8 @@ class Header:
     @staticmethod
     def read(secrets: Secrets, carriers: Carriers) -> Header | None:
         """None if there is none. One attempt in 2^16 finds a false header, which opens nothing."""
-        found = [places(secret, carriers) for secret in secrets.salted]
-        headers = [_read(secrets, carriers, found, depth) for depth in _DEPTHS]
+        found_places = [places(secret, carriers) for secret in secrets.salted]
+        headers = [_read(secrets, carriers, found_places, depth) for depth in _DEPTHS]
         return headers[0] or headers[1]
 
 

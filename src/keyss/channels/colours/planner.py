@@ -74,7 +74,9 @@ class Planner:
         if not len(self.carriers):
             return 0
         limit = max(self._level_bytes(ONE) * self._max_share, self._level_bytes(self._max_level))
-        largest = max((bucket_bytes(each) for each in range(256) if bucket_bytes(each) <= limit), default=0)
+        largest = max(
+            (bucket_bytes(index) for index in range(256) if bucket_bytes(index) <= limit), default=0
+        )
         return max(0, largest - OVERHEAD)
 
     @cached_property
@@ -92,9 +94,9 @@ class Planner:
         """
         padded = [bucket_bytes(bucket_of(size)) for size in sizes]
         independent = [self._layout(size, len(sizes)) for size in padded]
-        found = [each for each in independent if each is not None]
-        if len(found) == len(independent) and sum(each.share for each in found) <= 1:
-            return found, len(sizes) > MIN_HEADERS
+        layouts = [layout for layout in independent if layout is not None]
+        if len(layouts) == len(independent) and sum(layout.share for layout in layouts) <= 1:
+            return layouts, len(sizes) > MIN_HEADERS
         together = self._layout(sum(padded), len(sizes))
         if together is None:
             return None
@@ -119,7 +121,7 @@ class Planner:
     def _max_level(self) -> int:
         """The highest level that keeps STRENGTH with all carriers; ONE if there is none."""
         levels = range(1, LEVELS)
-        return bisect_left(levels, True, key=lambda each: self._psnr(each) < STRENGTH + _MARGIN)
+        return bisect_left(levels, True, key=lambda level: self._psnr(level) < STRENGTH + _MARGIN)
 
     def is_visible(self, stego: Gaussians) -> bool:
         """True if views of `stego` do not keep STRENGTH."""
@@ -215,8 +217,8 @@ class ColourStatistics:
             return np.zeros(len(self._colours), bool)
         typed = ((self._colours.view(np.uint32) & _SHORT) == 0).any(axis=1)
         grey = (self._colours == np.roll(self._colours, 1, axis=1)).any(axis=1)
-        found: Flags = self._repeated | typed | grey
-        return found
+        excluded: Flags = self._repeated | typed | grey
+        return excluded
 
     def imitate(self, new: Doubles) -> Doubles:
         """The colours [C, 3] with `new` greens and blues [C, 2], given the statistics of the model.
@@ -253,7 +255,7 @@ class Likelihood:
         row, near = np.arange(count), nearest_neighbours(positions, min(_NEIGHBOURS + 1, count))[1]
         further = near[:, 2:].ravel()
         ends = ((row, near[:, 1]), (np.repeat(row, near.shape[1] - 2), further), (row[1:], row[:-1]))
-        pairs = tuple(_both_ways(*each) for each in ends)
+        pairs = tuple(_both_ways(*pair) for pair in ends)
         weights = tuple(_fit_weights(pairs, colours, column, example[:, column]) for column in (1, 2))
         return Likelihood(pairs, weights)
 
@@ -293,10 +295,12 @@ def _features(
         which, other = place[pairs[:, 0]], pairs[:, 1]
         which, other = which[which >= 0], other[which >= 0]
         difference = values[which] - colours[other, column]
-        inside = [difference - (colours[rows[which], each] - colours[other, each]) for each in others]
+        inside = [
+            difference - (colours[rows[which], channel] - colours[other, channel]) for channel in others
+        ]
         for apart in (difference, *inside):
-            sums = [np.bincount(which, each, len(rows)) for each in _logs(apart)]
-            features.append([each.astype(np.float64) for each in sums])
+            sums = [np.bincount(which, values, len(rows)) for values in _logs(apart)]
+            features.append([feature.astype(np.float64) for feature in sums])
     return np.concatenate(features).T
 
 
@@ -308,7 +312,7 @@ def _fit_weights(every: Sequence[Integers], colours: Doubles, column: int, examp
     """Weights [F] of a logistic regression between the colours and the example."""
     rows = np.random.default_rng(0).permutation(len(colours))[:_SAMPLE]
     true, changed = (
-        _features(every, colours, rows, column, each[rows]) for each in (colours[:, column], example)
+        _features(every, colours, rows, column, side[rows]) for side in (colours[:, column], example)
     )
     difference = true - changed
     spread = difference.std(axis=0) + 1e-9
@@ -318,5 +322,5 @@ def _fit_weights(every: Sequence[Integers], colours: Doubles, column: int, examp
         error = 1 / (1 + np.exp((difference @ weights).clip(-50, 50)))
         hessian = (difference * (error * (1 - error))[:, None]).T @ difference + _RIDGE * np.eye(len(weights))
         weights += np.linalg.solve(hessian, difference.T @ error - _RIDGE * weights)
-    found: Doubles = weights / spread
-    return found
+    normalised: Doubles = weights / spread
+    return normalised

@@ -53,8 +53,8 @@ class Decoded:
 
     def __getitem__(self, rows: Integers) -> Decoded:
         """The model's Gaussians in another order; `codes` are unchanged."""
-        own, order = self.model[torch.from_numpy(rows)], self.order[rows]
-        return replace(self, model=own, exact=self.exact[rows], order=order)
+        model = self.model[torch.from_numpy(rows)]
+        return replace(self, model=model, exact=self.exact[rows], order=self.order[rows])
 
     @property
     def is_sorted(self) -> bool:
@@ -66,17 +66,17 @@ class Decoded:
         old, new = before.dequantise(), after.dequantise()
         changes = {}
         for name in _WRITTEN:
-            own, was, now = (getattr(each, name) for each in (self.model, old, new))
+            values, was, now = (getattr(model, name) for model in (self.model, old, new))
             if name == "quats":
-                now = now * _signs(own, was)
-            changes[name] = torch.where((was == getattr(new, name)).all(1, keepdim=True), own, now)
+                now = now * _signs(values, was)
+            changes[name] = torch.where((was == getattr(new, name)).all(1, keepdim=True), values, now)
         return replace(self.model, **changes)
 
 
 def _opacities_are_bytes(model: Gaussians) -> bool:
     """True if there are at most 256 different opacities, as in all of the formats."""
     parts = model.opacity_logits[:_SAMPLE], model.opacity_logits
-    return all(len(each.detach().unique()) <= _OPACITIES for each in parts)
+    return all(len(part.detach().unique()) <= _OPACITIES for part in parts)
 
 
 def _spz(model: Gaussians) -> Codes | None:
@@ -110,10 +110,10 @@ def _are_exact(model: Gaussians, decoded: Gaussians) -> Flags:
     signs = _signs(model.quats, decoded.quats)
     exact = ((model.quats - signs * decoded.quats).abs() < _CLOSE).all(1)
     for name in ("means", "log_scales"):
-        own: Tensor = getattr(model, name)
-        exact &= ((own - getattr(decoded, name)).abs() <= _CLOSE * own.abs()).all(1)
-    found: Flags = exact.numpy()
-    return found
+        values: Tensor = getattr(model, name)
+        exact &= ((values - getattr(decoded, name)).abs() <= _CLOSE * values.abs()).all(1)
+    flags: Flags = exact.numpy()
+    return flags
 
 
 def _signs(quats: Tensor, others: Tensor) -> Tensor:

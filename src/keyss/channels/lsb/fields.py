@@ -41,7 +41,7 @@ ROTATIONS: dict[type[Codes], tuple[int, int]] = {
     SogCodes: (0, 255),
     CompressedPlyCodes: (0, 1023),
 }
-FORMATS = {each.name: each for each in ROTATIONS}
+QUANTISED = {rotation.name: rotation for rotation in ROTATIONS}
 MAX_BITS = 10
 _POSITION_RANGE = -3.0  # log2 of the range of written positions, in sizes of the Gaussian
 LOG_SCALE_RANGE = -4.0  # log2 of the range of written log scales
@@ -100,7 +100,8 @@ def with_levels(codes: Any, levels: Mapping[str, Levels]) -> Any:
         written["rotations"] = np.abs(signed) + _SIGN * negative.astype(np.int32)
     old = {name: getattr(codes, name) for name in levels}
     return replace(
-        codes, **{name: written[name].reshape(each.shape).astype(each.dtype) for name, each in old.items()}
+        codes,
+        **{name: written[name].reshape(levels.shape).astype(levels.dtype) for name, levels in old.items()},
     )
 
 
@@ -112,7 +113,7 @@ def sog_distances(codes: SogCodes, levels: Numbers) -> Integers:
 
 def last_bits(fields: Sequence[Field]) -> Bytes:
     """The last bits of all levels, field after field."""
-    return np.concatenate([each.read() for each in fields])
+    return np.concatenate([field.read() for field in fields])
 
 
 def in_counted_order(codes: Codes, exact: Flags | None = None) -> tuple[Integers, Any, list[Field]]:
@@ -126,7 +127,7 @@ def in_counted_order(codes: Codes, exact: Flags | None = None) -> tuple[Integers
         hashes = _sog_hashes(codes)
         rows, silent = np.argsort(hashes, kind="stable"), silent | repeated(hashes)
     codes, silent = in_rows(codes, rows), silent[rows]
-    fields = [replace(each, bits=np.where(silent, 0, each.bits)) for each in _fields_of(codes)]
+    fields = [replace(field, bits=np.where(silent, 0, field.bits)) for field in _fields_of(codes)]
     return rows, codes, fields
 
 
@@ -170,7 +171,7 @@ def _sog_hashes(codes: SogCodes) -> Words:
     """[N] hashes of the values that are never written."""
     parts = (codes.scales, codes.colors, codes.alphas, codes.labels, codes.largest)
     levels = sog_distances(codes, codes.positions)
-    return row_hashes(np.concatenate([each.reshape(len(levels), -1) for each in (*parts, levels)], axis=1))
+    return row_hashes(np.concatenate([part.reshape(len(levels), -1) for part in (*parts, levels)], axis=1))
 
 
 def _fields_of(codes: Codes) -> list[Field]:
@@ -207,8 +208,8 @@ def _medians(values: Numbers) -> Doubles:
 def _log2(values: Doubles) -> Doubles:
     """Approximate log2, too small by up to 0.09: linear between powers of 2."""
     mantissa, exponent = np.frexp(values)
-    found: Doubles = exponent + 2 * (mantissa - 1)
-    return found
+    logarithms: Doubles = exponent + 2 * (mantissa - 1)
+    return logarithms
 
 
 def _fitting(logs: Doubles) -> Levels:
@@ -218,6 +219,6 @@ def _fitting(logs: Doubles) -> Levels:
 
 def _fields(name: str, levels: Numbers, bits: Levels | int) -> list[Field]:
     """A field of each column [N, C]."""
-    own = levels.astype(np.int32)
-    each_column = zip(own.T, np.broadcast_to(np.int32(bits), own.shape).T, strict=True)
+    signed = levels.astype(np.int32)
+    each_column = zip(signed.T, np.broadcast_to(np.int32(bits), signed.shape).T, strict=True)
     return [Field(name, index, *arrays) for index, arrays in enumerate(each_column)]

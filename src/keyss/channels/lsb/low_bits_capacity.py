@@ -31,8 +31,8 @@ from keyss.channels.reed_solomon import LOST, Codewords
 from keyss.core.errors import InputError, UsageError
 
 DATA_KEY_BYTES = 16
-# Places of each part of a data key, for each salt, and of each part of the parameters; two that can be read
-# suffice. With 60 % of the Gaussians usable and a quarter lost, fewer are left with p = 0.8 % and 1e-7.
+# Places of each fragment of a data key, for each salt, and of each fragment of the parameters. A reader needs
+# two: with 60 % of the Gaussians usable and a quarter lost, fewer are left in 0.8 % and 1e-5 % of files.
 _KEY_COPIES, _PARAMETER_COPIES = 12, 32
 TYPICAL_SHARE = 0.75  # usable Gaussians of a trained model; 0.40 to 1.00 were measured
 

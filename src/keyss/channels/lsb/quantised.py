@@ -22,7 +22,7 @@ from keyss.channels.container import Payload, SaltedReader
 from keyss.channels.lsb import wet_paper
 from keyss.channels.lsb.decoded import Decoded
 from keyss.channels.lsb.fields import (
-    FORMATS,
+    QUANTISED,
     Field,
     Levels,
     file_order,
@@ -66,7 +66,7 @@ class QuantisedChannel(Channel):
         With `decoded`, the cover is its model, perhaps with fewer harmonics.
         """
         if self.decoded is None:
-            return QuantisedCover.of(FORMATS[self.format].of(cover))
+            return QuantisedCover.of(QUANTISED[self.format].of(cover))
         return QuantisedCover.of(self.decoded.codes, replace(self.decoded, model=cover.detach().to("cpu")))
 
     def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
@@ -86,11 +86,11 @@ class QuantisedCover:
     @staticmethod
     def of(codes: Codes, decoded: Decoded | None = None) -> QuantisedCover:
         """`decoded`: its model is published instead of the file. Raises UsageError for no capacity."""
-        rows, ordered, own = in_counted_order(codes, decoded.exact if decoded else None)
+        rows, ordered, places = in_counted_order(codes, decoded.exact if decoded else None)
         model = decoded[rows] if decoded else None
         own_hash = model_hash(ordered, model.model if model else None)
-        free = writable_levels(ordered, own, fixed_axes(codes), _digest(codes))
-        cover = QuantisedCover(ordered, own, free, own_hash, model)
+        free = writable_levels(ordered, places, fixed_axes(codes), _digest(codes))
+        cover = QuantisedCover(ordered, places, free, own_hash, model)
         if len(cover.ids) < MIN_BLOCKS or cover.width < LEAST_BYTES:
             why = "it has too few Gaussians"
             if len(cover.ids) >= MIN_BLOCKS:
@@ -107,7 +107,7 @@ class QuantisedCover:
     @cached_property
     def dry(self) -> Bits:
         """1 for last bits that may be written."""
-        parts = [np.repeat(free, each.bits) for free, each in zip(self.free, self.fields, strict=True)]
+        parts = [np.repeat(free, field.bits) for free, field in zip(self.free, self.fields, strict=True)]
         return np.concatenate(parts).astype(np.uint8)
 
     @cached_property
@@ -138,15 +138,15 @@ class QuantisedCover:
         contents = [payload for _, payload in payloads]
         mixed = container.randomness(entropy, contents, _digest(self.codes))
         for attempt in range(_ATTEMPTS):
-            own = expand(mixed, f"lsb/attempt/{attempt}", 32)
+            seed = expand(mixed, f"lsb/attempt/{attempt}", 32)
             table = np.empty((len(self.ids), self.width), np.uint8)
-            fill(own, "lsb/noise", table)
+            fill(seed, "lsb/noise", table)
             first = salt(self.ids[0], table[0, :LEAST_BYTES])
             keys = [container.key_secret(DerivedKey.of(key, first)) for key, _ in payloads]
             container.check_keys(keys)
-            self._write(table, own, keys, contents)
-            if (bits := self._solve(table, own)) is not None:
-                return self._model_to_publish(self._with_bits(bits, own), own)
+            self._write(table, seed, keys, contents)
+            if (bits := self._solve(table, seed)) is not None:
+                return self._model_to_publish(self._with_bits(bits, seed), seed)
         raise RuntimeError("the blocks of this cover cannot be solved")
 
     def _write(
@@ -189,12 +189,12 @@ class QuantisedCover:
     def _with_bits(self, bits: Bits, entropy: bytes) -> Codes:
         """The quantised values with new last `bits` of all levels."""
         columns: dict[str, list[Levels]] = {}
-        parts = np.split(bits, np.cumsum([each.total_bits for each in self.fields])[:-1])
-        for field, free, own in zip(self.fields, self.free, parts, strict=True):
+        parts = np.split(bits, np.cumsum([field.total_bits for field in self.fields])[:-1])
+        for field, free, field_bits in zip(self.fields, self.free, parts, strict=True):
             ties = random_fractions(entropy, f"codes/ties/{field.name}/{field.column}", len(free)) - 0.5
-            levels = np.where(free, field.with_bits(own, ties), field.levels)
+            levels = np.where(free, field.with_bits(field_bits, ties), field.levels)
             columns.setdefault(field.name, []).append(levels)
-        attributes = {name: np.stack(each, axis=1) for name, each in columns.items()}
+        attributes = {name: np.stack(column, axis=1) for name, column in columns.items()}
         codes: Codes = with_levels(self.codes, attributes)
         return codes
 
@@ -234,10 +234,10 @@ class QuantisedReader(SaltedReader):
         opened = self.blocks[:, : container.PARAMETER_BYTES] ^ parameter_pads(data_key, self.ids)
         check = np.frombuffer(container.check_of(data_key), np.uint8)
         rows = np.flatnonzero((opened[:, : len(check)] == check).all(axis=1))
-        found = container.Parameters.unpack(opened[rows[0]].tobytes(), data_key) if len(rows) else None
-        if found is None:
+        parameters = container.Parameters.unpack(opened[rows[0]].tobytes(), data_key) if len(rows) else None
+        if parameters is None:
             raise WrongKeyError()
-        width, count = found.depth, found.count
+        width, count = parameters.depth, parameters.count
         if not 0 < count < len(self.blocks) or not 0 < width <= self.blocks.shape[1]:
             raise InputError("the hidden parameters are damaged: the data they describe exceed the file")
         rows = (rows[0] + 1 + np.arange(count)) % len(self.blocks)
@@ -252,7 +252,7 @@ def _capacity(total: int, width: int) -> Capacity:
 
 def _digest(codes: Codes) -> bytes:
     state = hashlib.sha256()
-    for each in fields(codes):  # type: ignore[arg-type]
-        value = getattr(codes, each.name)
+    for attribute in fields(codes):  # type: ignore[arg-type]
+        value = getattr(codes, attribute.name)
         state.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
     return state.digest()

@@ -9,11 +9,11 @@ of one Gaussian at the least depth. Each fragment has several places, the Gaussi
 values among those that the function assigns to it. Some of these cannot be written, are taken or lost. A
 reader looks at eight times as many, because others may have been added: the most frequent content counts.
 
-*Shards* of a payload fill all Gaussians of a secret's share. The function assigns each Gaussian to a group of
-codewords, and masks the number that a shard has in its group. In rows of 5 bytes and more, a tag of one byte
-precedes it: of other Gaussians one in 256 has the right one by chance; in smaller rows, one in 64 has the
-number of a shard. Such false shards contradict true ones, which are lost thereby, or are errors, which the
-code corrects.
+*Shards* of a payload fill all Gaussians of a secret's share. The function assigns each Gaussian to a group
+of codewords, and masks the number that a shard has in its group. Rows of 5 bytes and more begin with a tag of
+one byte, which one in 256 of the other Gaussians has by chance. Smaller rows have none; there, one in 64 has
+a valid number by chance. Such false shards either contradict a true one, so that both are lost, or are
+errors, which the code corrects.
 """
 
 from __future__ import annotations
@@ -80,17 +80,17 @@ class Message:
         places = [rows[: self.copies] for rows in self._candidates(ids)]
         rows = np.concatenate(places)
         pads = function(self.secret, f"{self.label}/pad", ids[rows], self.width)
-        contents = np.repeat(every.reshape(-1, self.width), [len(each) for each in places], axis=0)
+        contents = np.repeat(every.reshape(-1, self.width), [len(rows) for rows in places], axis=0)
         return rows, contents ^ pads
 
     def read(self, ids: Bytes, low: Bytes) -> bytes:
         """The most frequent content of each fragment in `low` [N, width or more]."""
-        found = b""
+        message = b""
         for rows in self._candidates(ids):
             pads = function(self.secret, f"{self.label}/pad", ids[rows], self.width)
             contents, times = np.unique(low[rows, : self.width] ^ pads, axis=0, return_counts=True)
-            found += contents[times.argmax()].tobytes() if len(rows) else bytes(self.width)
-        return found[: self.size]
+            message += contents[times.argmax()].tobytes() if len(rows) else bytes(self.width)
+        return message[: self.size]
 
     def _candidates(self, ids: Bytes) -> Iterator[Integers]:
         """The rows that are looked at for each fragment, its places first."""
@@ -100,8 +100,8 @@ class Message:
         near = np.argpartition(order, count)[:count] if count < len(order) else np.arange(len(order))
         near = near[order[near].argsort()]
         fragment = values[near, 8:12].copy().view("<u4")[:, 0] % self.fragments
-        for each in range(self.fragments):
-            yield near[fragment == each]
+        for index in range(self.fragments):
+            yield near[fragment == index]
 
 
 @dataclass(frozen=True)
@@ -128,9 +128,9 @@ class Shards:
         if sizes.min() < self.in_group:
             return None
         place = np.arange(len(ids)) - np.repeat(sizes.cumsum() - sizes, sizes)
-        found = np.empty(len(ids), np.int64)
-        found[order] = self._number(group[order], place % self.in_group)
-        return found
+        groups = np.empty(len(ids), np.int64)
+        groups[order] = self._number(group[order], place % self.in_group)
+        return groups
 
     def encrypt(self, ids: Bytes, numbers: Integers, shards: Bytes) -> Bytes:
         """[R, ...] rows of shards [R, width] with `numbers` [R], in the groups of `ids` [R, 16]."""

@@ -72,13 +72,13 @@ def write(bits: Bits, dry: Bits, messages: Bits) -> Bits | None:
     changed = _product(messages ^ read(bits, messages.shape[1]), inverse.T)
     blocks, may = bits.reshape(-1, BLOCK).copy(), dry.reshape(-1, BLOCK) == 1
     rest = np.zeros((len(blocks), len(others)), np.uint8)
-    for own, wanted, found in zip(may, changed, rest, strict=True):
-        stay, inside = ~own[pivots], np.flatnonzero(own[others])
+    for writable, wanted, remainder in zip(may, changed, rest, strict=True):
+        stay, inside = ~writable[pivots], np.flatnonzero(writable[others])
         system = np.concatenate([free[stay][:, inside], wanted[stay, None]], axis=1)
         system, columns = _reduced(system, len(inside))
         if system[columns < 0, -1].any():
             return None
-        found[inside[columns[columns >= 0]]] = system[columns >= 0, -1]
+        remainder[inside[columns[columns >= 0]]] = system[columns >= 0, -1]
     blocks[:, pivots] ^= changed ^ _product(rest, free.T)
     blocks[:, others] ^= rest
     return blocks.reshape(-1)
@@ -112,17 +112,17 @@ def _reduced(rows: Bits, count: int) -> tuple[Bits, Integers]:
 
 
 @kernel
-def _eliminate_packed(own, count):  # type: ignore[no-untyped-def]
+def _eliminate_packed(matrix, count):  # type: ignore[no-untyped-def]
     """`_reduced` in place, with eight columns to a byte, the first in its highest bit."""
-    columns = np.full(len(own), -1)
-    for row in range(len(own)):
+    columns = np.full(len(matrix), -1)
+    for row in range(len(matrix)):
         for column in range(count):
             byte, bit = column >> 3, np.uint8(128 >> (column & 7))
-            if own[row, byte] & bit:
+            if matrix[row, byte] & bit:
                 columns[row] = column
-                for other in range(len(own)):
-                    if other != row and own[other, byte] & bit:
-                        for at in range(own.shape[1]):  # takes a fifth of what slices do
-                            own[other, at] ^= own[row, at]
+                for other in range(len(matrix)):
+                    if other != row and matrix[other, byte] & bit:
+                        for at in range(matrix.shape[1]):  # takes a fifth of what slices do
+                            matrix[other, at] ^= matrix[row, at]
                 break
     return columns

@@ -57,15 +57,15 @@ def writable_levels(codes: Codes, fields: list[Field], fixed: Flags, secret: byt
     stable = _keep_largest(codes, fields, random_fractions(secret, "kept/turns", count))
     ordered = _keep_order(codes, fields, means)
     free = []
-    for field, own in zip(fields, left, strict=True):
+    for field, writable in zip(fields, left, strict=True):
         random = random_fractions(secret, f"kept/{field.name}/{field.column}", count)
-        own &= field.bits > 0
-        own &= _margin(codes, field) > random * _RAMP * (1 << field.bits)
+        writable &= field.bits > 0
+        writable &= _margin(codes, field) > random * _RAMP * (1 << field.bits)
         if field.name == "rotations":
-            own &= stable
+            writable &= stable
         elif field.name == "positions":
-            own &= ordered & ~fixed[field.column]
-        free.append(own if _is_natural(field.levels[own]) else np.zeros_like(own))
+            writable &= ordered & ~fixed[field.column]
+        free.append(writable if _is_natural(field.levels[writable]) else np.zeros_like(writable))
     return free
 
 
@@ -105,8 +105,8 @@ def _without_excess(
     """
     left = [free.copy() for _ in fields]
     for index, kind in enumerate(_kinds(codes, fields, log_scales, near)):
-        own, pairs = left[kind.fields[0]], [kind.one] if kind.other is None else [kind.one, kind.other]
-        moved = np.flatnonzero(np.any([own[rows] for rows in pairs], axis=0))
+        writable, pairs = left[kind.fields[0]], [kind.one] if kind.other is None else [kind.one, kind.other]
+        moved = np.flatnonzero(np.any([writable[rows] for rows in pairs], axis=0))
         random = random_fractions(secret, f"kept/excess/{index}", len(moved))
         stays = moved[random < _excess_share(kind.gaps[moved], kind.ends, kind.dimensions)]
         for field, rows in product(kind.fields, pairs):
@@ -118,30 +118,32 @@ def _kinds(codes: Codes, fields: Sequence[Field], log_scales: Doubles, near: Int
     """Equal coordinates of neighbours, small and equal parts of rotations, round Gaussians, and clones."""
     every = np.arange(len(near))
     one, other = np.repeat(every, near.shape[1]), near.ravel()
-    at = {name: [index for index, each in enumerate(fields) if each.name == name] for name in _NAMES}
+    at = {name: [index for index, field in enumerate(fields) if field.name == name] for name in _NAMES}
     for index in at["positions"]:
         levels, bits = fields[index].levels, fields[index].bits
         free = np.flatnonzero((bits[one] > 0) & (bits[other] > 0))
         gaps = np.abs(levels[one[free]] - levels[other[free]]).astype(np.float64)
         yield _Kind([index], gaps, np.array(_LEVELS[:4]), 1, one[free], other[free])
-    if own := at["rotations"]:
-        turns = np.stack([fields[index].levels for index in own], axis=1).astype(np.float64)
-        ends = np.array(_LEVELS[: 5 + 2 * int(fields[own[0]].bits.max() > 2)])
+    if columns := at["rotations"]:
+        turns = np.stack([fields[index].levels for index in columns], axis=1).astype(np.float64)
+        ends = np.array(_LEVELS[: 5 + 2 * int(fields[columns[0]].bits.max() > 2)])
         parts = np.abs(turns - sum(ROTATIONS[type(codes)]) / 2)
         from_zero = ends + parts.flat[0] % 1  # the middle lies between two levels in some formats
         for part in parts.T:
-            yield _Kind(own, part, from_zero, 1, every)
-        yield _Kind(own, parts.max(axis=1), from_zero, 3, every)
+            yield _Kind(columns, part, from_zero, 1, every)
+        yield _Kind(columns, parts.max(axis=1), from_zero, 3, every)
         for a, b in combinations(parts.T, 2):
-            yield _Kind(own, np.abs(a - b), ends, 1, every)
+            yield _Kind(columns, np.abs(a - b), ends, 1, every)
         same = np.flatnonzero(codes.largest[one] == codes.largest[other])  # type: ignore[attr-defined]
         gaps = np.abs(turns[one[same]] - turns[other[same]]).max(axis=1)
-        yield _Kind(own, gaps, ends, 3, one[same], other[same])
-    if own := at["scales"]:
+        yield _Kind(columns, gaps, ends, 3, one[same], other[same])
+    if columns := at["scales"]:
         for a, b in combinations(log_scales.T, 2):
-            yield _Kind(own, np.abs(a - b), _LOG_SCALES, 1, every)
-        yield _Kind(own, log_scales.max(axis=1) - log_scales.min(axis=1), _LOG_SCALES, 2, every)
-        yield _Kind(own, np.abs(log_scales[one] - log_scales[other]).max(axis=1), _LOG_SCALES, 3, one, other)
+            yield _Kind(columns, np.abs(a - b), _LOG_SCALES, 1, every)
+        yield _Kind(columns, log_scales.max(axis=1) - log_scales.min(axis=1), _LOG_SCALES, 2, every)
+        yield _Kind(
+            columns, np.abs(log_scales[one] - log_scales[other]).max(axis=1), _LOG_SCALES, 3, one, other
+        )
 
 
 def _excess_share(gaps: Doubles, ends: Doubles, dimensions: int) -> Doubles:
@@ -151,8 +153,8 @@ def _excess_share(gaps: Doubles, ends: Doubles, dimensions: int) -> Doubles:
     expected = counts[-1] / volumes[-1] * volumes
     large = counts - expected > np.maximum(_ROUGH * expected, _DEVIATIONS * expected**0.5)
     share = np.where(large, 1 - expected / np.maximum(counts, 1), 0.0)
-    found: Doubles = np.append(share, 0.0)[np.searchsorted(ends, gaps)]
-    return found
+    shares: Doubles = np.append(share, 0.0)[np.searchsorted(ends, gaps)]
+    return shares
 
 
 def _keep_order(codes: Codes, fields: list[Field], means: Doubles) -> Flags:
@@ -162,7 +164,7 @@ def _keep_order(codes: Codes, fields: list[Field], means: Doubles) -> Flags:
     """
     if not isinstance(codes, SpzCodes) or not is_in_morton_order(means.astype(np.float32)):
         return np.ones(len(means), np.bool_)
-    reach = np.stack([each.reach for each in fields if each.name == "positions"], axis=1)
+    reach = np.stack([field.reach for field in fields if field.name == "positions"], axis=1)
     least, largest = (
         morton_keys(means + sign * reach * 2.0**-codes.fractional_bits, means) for sign in (-1, 1)
     )
@@ -180,8 +182,8 @@ def _not_clones(fields: list[Field], ratio: Doubles, near: Integers, random: Dou
     """
     both = np.minimum(np.arange(len(near)), near[:, 1])  # mutual nearest neighbours share one decision
     single: Flags = random[both] * (1 + ratio**3) < ratio**3
-    for name in {each.name for each in fields}:
-        levels = np.stack([each.levels for each in fields if each.name == name], axis=1)
+    for name in {field.name for field in fields}:
+        levels = np.stack([field.levels for field in fields if field.name == name], axis=1)
         single &= ~(levels[near[:, 1:]] == levels[:, None]).all(axis=2).any(axis=1)
     return single
 
@@ -212,14 +214,14 @@ def _to_next_distance(codes: SogCodes, field: Field) -> Doubles:
 
 def _keep_largest(codes: Codes, fields: list[Field], random: Doubles) -> Flags:
     """[N] which rotations keep their largest component, the one that is not stored."""
-    own = [each for each in fields if each.name == "rotations"]
-    if not own:
+    rotations = [field for field in fields if field.name == "rotations"]
+    if not rotations:
         return np.ones(len(random), np.bool_)
     least, largest = ROTATIONS[type(codes)]
-    parts = np.abs(np.stack([each.levels for each in own], axis=1) - (least + largest) / 2)
-    parts += np.stack([each.reach for each in own], axis=1)
+    parts = np.abs(np.stack([field.levels for field in rotations], axis=1) - (least + largest) / 2)
+    parts += np.stack([field.reach for field in rotations], axis=1)
     rest = np.sqrt(np.maximum(0.0, (largest - least) ** 2 / 2 - np.square(parts).sum(axis=1)))
-    stable: Flags = rest - parts.max(axis=1) > random * _RAMP * (1 << own[0].bits)
+    stable: Flags = rest - parts.max(axis=1) > random * _RAMP * (1 << rotations[0].bits)
     return stable
 
 
@@ -230,8 +232,8 @@ def _is_natural(levels: Levels) -> bool:
     """
     if len(levels) < 2:
         return True
-    values, found = np.unique(levels.astype(np.int64), return_counts=True)
-    counts = found.astype(np.int64)
+    values, counts = np.unique(levels.astype(np.int64), return_counts=True)
+    counts = counts.astype(np.int64)
     equal = float((counts * (counts - 1)).sum())
     near = [_pairs(values, counts, distance) for distance in range(1, _NEAR + 1)]
     expected = float(np.mean(near))

@@ -93,9 +93,9 @@ class CodedGaussians(Gaussians):
     def of(codes: Codes, model: Gaussians | None = None) -> CodedGaussians:
         """The dequantised model; `model` is given if it has been decoded before."""
         model = codes.dequantise() if model is None else model
-        found = CodedGaussians(*(getattr(model, each.name) for each in fields(model)))
-        object.__setattr__(found, "codes", codes)
-        return found
+        coded = CodedGaussians(*(getattr(model, field.name) for field in fields(model)))
+        object.__setattr__(coded, "codes", codes)
+        return coded
 
     def to(self, device: torch.device | str) -> Gaussians:
         moved = super().to(device)
@@ -133,14 +133,17 @@ def gaussians_of(
     colors: Numbers,  # [N, 3], f_dc
     rest: Numbers,  # [N, K - 1, 3], the other harmonics
 ) -> Gaussians:
-    """A model from arrays. Values that are not finite in single precision become infinite or NaN."""
+    """A model from arrays, with opacities in place of logits.
+
+    Values that are not finite in single precision become infinite or NaN.
+    """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         sh = np.empty((len(rest), 1 + rest.shape[1], 3), np.float32)
         sh[:, 0], sh[:, 1:] = colors, rest
         share = np.asarray(opacities, dtype=np.float64)
         logits = (np.log(share) - np.log1p(-share)).clip(-OPACITY_LOGIT_BOUND, OPACITY_LOGIT_BOUND)
         parts = (means, quats, log_scales, logits, sh)
-        return Gaussians(*(torch.from_numpy(np.require(each, np.float32, ["C", "W"])) for each in parts))
+        return Gaussians(*(torch.from_numpy(np.require(part, np.float32, ["C", "W"])) for part in parts))
 
 
 def blocks_of(count: int) -> Iterator[slice]:
@@ -158,14 +161,14 @@ def assembled(count: int, blocks: Iterable[Gaussians], *, drop: bool = False) ->
     wrong: dict[str, None] = {}  # an ordered set
     end = 0
     for block in blocks:
-        if found := _not_finite(block):
-            wrong |= dict.fromkeys(found)
-            columns = [getattr(block, each.name).reshape(len(block), -1) for each in fields(block)]
+        if names := _not_finite(block):
+            wrong |= dict.fromkeys(names)
+            columns = [getattr(block, field.name).reshape(len(block), -1) for field in fields(block)]
             block = block[torch.cat(columns, dim=1).isfinite().all(1)]
-        parts = [getattr(block, each.name) for each in fields(block)]
-        whole = whole or [each.new_empty((count, *each.shape[1:])) for each in parts]
-        for own, part in zip(whole, parts, strict=True):
-            own[end : end + len(part)] = part
+        parts = [getattr(block, field.name) for field in fields(block)]
+        whole = whole or [part.new_empty((count, *part.shape[1:])) for part in parts]
+        for column, part in zip(whole, parts, strict=True):
+            column[end : end + len(part)] = part
         end += len(block)
     if wrong and not (drop and end):
         raise InputError(f"NaN or infinite values in {', '.join(wrong)}")
@@ -176,14 +179,16 @@ def assembled(count: int, blocks: Iterable[Gaussians], *, drop: bool = False) ->
             KeyssWarning,
             stacklevel=2,
         )
-    return Gaussians(*(each[:end] for each in whole))
+    return Gaussians(*(column[:end] for column in whole))
 
 
 def _not_finite(model: Gaussians) -> list[str]:
     """Names of attributes with NaN or infinite values."""
     # A finite sum has finite terms, and takes a thirtieth of the time.
-    values = {each.name: getattr(model, each.name) for each in fields(model)}
-    return [name for name, own in values.items() if not (own.sum().isfinite() or own.isfinite().all())]
+    values = {field.name: getattr(model, field.name) for field in fields(model)}
+    return [
+        name for name, column in values.items() if not (column.sum().isfinite() or column.isfinite().all())
+    ]
 
 
 def writable(model: Gaussians) -> Gaussians:
@@ -201,10 +206,10 @@ def writable(model: Gaussians) -> Gaussians:
 
 
 def arrays_of(model: Gaussians) -> tuple[Floats, Doubles, Floats, Doubles, Floats, Floats]:
-    """The arguments of `gaussians_of` with unit quaternions, from a model on any device."""
+    """The arguments of `gaussians_of`, from a model on any device. Rounds: opacities, unit quaternions."""
     flat = model.detach().to("cpu")
     parts = (flat.means, flat.quats, flat.log_scales, flat.opacity_logits, flat.sh)
-    means, quats, log_scales, opacity_logits, sh = (each.numpy() for each in parts)
+    means, quats, log_scales, opacity_logits, sh = (part.numpy() for part in parts)
     with np.errstate(over="ignore"):
         opacities = 1 / (1 + np.exp(-opacity_logits.astype(np.float64)))
     return means, unit(quats), log_scales, opacities, sh[:, 0], sh[:, 1:]
@@ -235,8 +240,8 @@ def log_scales_of(scales: Numbers) -> Doubles:
     """Logarithms of scales: 0 becomes the smallest normal number, negative scales NaN."""
     with np.errstate(invalid="ignore"):
         values = np.asarray(scales, dtype=np.float64)
-        found: Doubles = np.log(np.where(values == 0, np.finfo(np.float32).tiny, values))
-    return found
+        logs: Doubles = np.log(np.where(values == 0, np.finfo(np.float32).tiny, values))
+    return logs
 
 
 def scales_of(log_scales: Floats) -> Floats:
@@ -249,8 +254,8 @@ def unit(quats: Numbers) -> Doubles:
     values = quats.astype(np.float64)
     length = np.linalg.norm(values, axis=1, keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
-        found: Doubles = np.where(length > 0, values / length, [1.0, 0.0, 0.0, 0.0])
-    return found
+        units: Doubles = np.where(length > 0, values / length, [1.0, 0.0, 0.0, 0.0])
+    return units
 
 
 def with_largest_w(quats: Doubles) -> Doubles:
@@ -263,8 +268,8 @@ def with_largest_w(quats: Doubles) -> Doubles:
     order = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])  # q, q i, q j, q k
     signs = np.array([[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]])
     turned = np.take_along_axis(quats, order[largest], 1) * signs[largest]
-    found: Doubles = turned * np.where(turned[:, :1] < 0, -1.0, 1.0)
-    return found
+    quaternion: Doubles = turned * np.where(turned[:, :1] < 0, -1.0, 1.0)
+    return quaternion
 
 
 def smallest_three(quats: Doubles) -> tuple[Bytes, Doubles]:

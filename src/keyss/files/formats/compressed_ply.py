@@ -114,7 +114,7 @@ class CompressedPlyCodes(Codes):
         colors = f_dc.astype(np.float64) * SH_C0 + 0.5
         parts = [means.astype(np.float64), log_scales.astype(np.float64), colors]
         starts, ends = np.arange(0, len(model), CHUNK), (np.minimum, np.maximum)
-        bounds = np.concatenate([end.reduceat(each, starts) for each in parts for end in ends], axis=1)
+        bounds = np.concatenate([end.reduceat(part, starts) for part in parts for end in ends], axis=1)
         bounds[:, 6:12] = bounds[:, 6:12].clip(-_SCALE_LIMIT, _SCALE_LIMIT)
         bounds = bounds.astype(np.float32)
         between = bounds.astype(np.float64).repeat(CHUNK, axis=0)[: len(model)].reshape(-1, 3, 2, 3)
@@ -149,8 +149,8 @@ class CompressedPlyCodes(Codes):
 
 
 def _has(table: npt.NDArray[np.void], names: list[str], code: str) -> bool:
-    found: Mapping[str, Any] = table.dtype.fields or {}
-    return all(name in found and found[name][0].newbyteorder("=") == np.dtype(code) for name in names)
+    types: Mapping[str, Any] = table.dtype.fields or {}
+    return all(name in types and types[name][0].newbyteorder("=") == np.dtype(code) for name in names)
 
 
 def _harmonics(table: npt.NDArray[np.void] | None, n: int) -> Bytes:

@@ -22,7 +22,7 @@ from keyss.files.formats.common import reason
 FORMAT = "keyss-decoded/1"
 _MAX_HEADER_BYTES = 1 << 17  # an empty tensor takes 20 times its header entry in memory
 
-_NAMES = tuple(each.name for each in fields(Gaussians))
+_NAMES = tuple(field.name for field in fields(Gaussians))
 
 
 def write(model: DecodedGaussians) -> bytes:
@@ -30,8 +30,8 @@ def write(model: DecodedGaussians) -> bytes:
     tensors = {name: getattr(model, name) for name in _NAMES} | model.network.tensors()
     if model.features is not None:
         tensors["features"] = model.features
-    kept = {name: each.detach().cpu().float().contiguous() for name, each in tensors.items()}
-    if wrong := [name for name, each in kept.items() if not bool(each.isfinite().all())]:
+    kept = {name: tensor.detach().cpu().float().contiguous() for name, tensor in tensors.items()}
+    if wrong := [name for name, tensor in kept.items() if not bool(tensor.isfinite().all())]:
         raise OutputError(f"NaN or infinite values in {', '.join(wrong)}")
     if not len(model):
         raise OutputError("it holds no Gaussians")

@@ -222,7 +222,10 @@ def _chunks(data: bytes) -> tuple[_Document, memoryview]:
 
 def _instances(document: _Document) -> Iterator[tuple[Doubles, _Primitive]]:
     """The primitives of Gaussians in the scene, each with its transform [4, 4] to the scene's coordinates."""
-    splats = [[each for each in mesh.primitives if EXTENSION in each.extensions] for mesh in document.meshes]
+    splats = [
+        [primitive for primitive in mesh.primitives if EXTENSION in primitive.extensions]
+        for mesh in document.meshes
+    ]
     try:
         roots = range(len(document.nodes))
         if document.scenes:
@@ -241,15 +244,15 @@ def _instances(document: _Document) -> Iterator[tuple[Doubles, _Primitive]]:
             node = document.nodes[index]
             path = (*above, node)
             stack += [(child, path) for child in node.children]
-            own = [] if node.mesh is None else splats[node.mesh]
-            left -= len(own)
+            primitives = [] if node.mesh is None else splats[node.mesh]
+            left -= len(primitives)
             if left < 0:
                 raise InputError(
                     f"expected at most {_MAX_PARTS} groups of Gaussians in a glTF file, found more"
                 )
-            if own:
+            if primitives:
                 to_scene = reduce(np.matmul, map(_transform, path))
-                yield from ((to_scene, primitive) for primitive in own)
+                yield from ((to_scene, primitive) for primitive in primitives)
     except (IndexError, TypeError) as error:
         raise InputError("damaged glTF: it refers to a missing part") from error
 
@@ -308,7 +311,7 @@ class _Attributes:
 
     def gaussians(self, part: slice) -> Gaussians:
         """Some of the Gaussians. Raises InputError for opacities out of range."""
-        alphas, sh = self.alphas[part][:, 0], [each[part] for each in self.sh]
+        alphas, sh = self.alphas[part][:, 0], [band[part] for band in self.sh]
         if ((alphas < 0) | (alphas > 1)).any():
             raise InputError("damaged glTF: opacities outside of 0 to 1")
         quats = unit(np.roll(self.quats[part], 1, axis=1))
@@ -327,17 +330,17 @@ def _attributes(document: _Document, primitive: _Primitive, binary: memoryview) 
         return _values(document, primitive.attributes[name], width, binary)
 
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in primitive.attributes)
-    found = _Attributes(
+    attributes = _Attributes(
         means=attribute("POSITION", 3),
         quats=attribute(f"{EXTENSION}:ROTATION", 4),
         scales=attribute(f"{EXTENSION}:SCALE", 3),
         alphas=attribute(f"{EXTENSION}:OPACITY", 1),
         sh=[attribute(name, 3) for name in _coefficients(degree)],
     )
-    others = (found.quats, found.scales, found.alphas, *found.sh)
-    if not len(found) or any(len(each) != len(found) for each in others):
+    others = (attributes.quats, attributes.scales, attributes.alphas, *attributes.sh)
+    if not len(attributes) or any(len(column) != len(attributes) for column in others):
         raise InputError("damaged glTF: no Gaussians, or attributes of different lengths")
-    return found
+    return attributes
 
 
 def _values(document: _Document, index: int, width: int, binary: memoryview) -> _Values:
@@ -351,7 +354,7 @@ def _values(document: _Document, index: int, width: int, binary: memoryview) -> 
     if accessor.bufferView is None or not 0 <= accessor.bufferView < len(document.bufferViews):
         raise InputError("damaged glTF: it refers to a missing buffer view")
     view = document.bufferViews[accessor.bufferView]
-    if view.buffer != 0 or any("uri" in each for each in document.buffers[:1]):
+    if view.buffer != 0 or any("uri" in buffer for buffer in document.buffers[:1]):
         raise InputError("expected a .glb that contains its data, found one that refers to other files")
     dtype = np.dtype(code)
     row = width * dtype.itemsize

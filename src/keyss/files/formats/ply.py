@@ -65,18 +65,18 @@ def read(file: BinaryIO) -> Gaussians:
         start = part.stop
     check_not_activated(means[:start], log_scales[:start], opacity_logits[:start])
     arrays = (means, quats, log_scales, opacity_logits, sh)
-    return Gaussians(*(torch.from_numpy(each[:start]) for each in arrays))
+    return Gaussians(*(torch.from_numpy(array[:start]) for array in arrays))
 
 
 def holds(file: BinaryIO, model: Gaussians) -> bool:
     """True if `read` gives `model`, to the bit; takes no memory for a second model. Raises InputError."""
     flat, start = model.detach().to("cpu"), 0
     for rows, _ in read_rows(file)[2]:
-        own = np.delete(_rows(flat[start : start + len(rows)]), slice(3, 6), axis=1)  # normals
-        if own.shape != rows.shape or (own.view(np.uint32) != rows.view(np.uint32)).any():
+        values = np.delete(_rows(flat[start : start + len(rows)]), slice(3, 6), axis=1)  # normals
+        if values.shape != rows.shape or (values.view(np.uint32) != rows.view(np.uint32)).any():
             return False
         start += len(rows)
-    check_not_activated(*(each.numpy() for each in (flat.means, flat.log_scales, flat.opacity_logits)))
+    check_not_activated(*(tensor.numpy() for tensor in (flat.means, flat.log_scales, flat.opacity_logits)))
     return start == len(flat)
 
 
@@ -92,7 +92,7 @@ def write(model: Gaussians, file: BinaryIO) -> None:
     n, needed = len(flat), model_names(flat.sh.shape[1])
     names = _names_with_normals(needed)
     further = {name: values for name, values in extras.properties.items() if name not in _NORMALS}
-    types = dict.fromkeys(names, "f4") | {name: each.dtype.str[1:] for name, each in further.items()}
+    types = dict.fromkeys(names, "f4") | {name: column.dtype.str[1:] for name, column in further.items()}
     order = [name for name in extras.order if name in types]
     if not set(needed) <= set(order):
         order = list(types)
@@ -107,8 +107,8 @@ def write(model: Gaussians, file: BinaryIO) -> None:
             continue
         table = np.empty(len(rows), dtype)
         for name in order:
-            own = extras.properties.get(name)
-            table[name] = rows[:, names.index(name)] if own is None else own[part]
+            column = extras.properties.get(name)
+            table[name] = rows[:, names.index(name)] if column is None else column[part]
         file.write(table.data)
 
 
@@ -138,7 +138,7 @@ def with_extras(model: Gaussians, source: Any, read: Gaussians) -> Gaussians:
     if extras is None:
         return model
     kept = extras.properties if _has_rows_of(model, read) else {}
-    extended = _ExtendedGaussians(*(getattr(model, each.name) for each in fields(Gaussians)))
+    extended = _ExtendedGaussians(*(getattr(model, field.name) for field in fields(Gaussians)))
     padded = {name: np.pad(values, (0, more)) for name, values in kept.items()}
     object.__setattr__(extended, "extras", replace(extras, properties=padded))
     return extended
@@ -163,8 +163,8 @@ def _read_extras(path: Path, count: int) -> _Extras | None:
         names = [name for name in order if name not in needed]
         blocks = [{name: table[name].copy() for name in names} for _, table in rows]
     values = {name: np.concatenate([block[name] for block in blocks]) for name in names}
-    values = {name: each for name, each in values.items() if name not in _NORMALS or each.any()}
-    if any(len(each) != count for each in values.values()):
+    values = {name: column for name, column in values.items() if name not in _NORMALS or column.any()}
+    if any(len(column) != count for column in values.values()):
         raise InputError(f"{path}: it changed while it was read")
     return _Extras(tuple(vertices.comments), order, values)
 

@@ -229,8 +229,8 @@ class SogCodes(Codes):
         extent = np.where(self.maxs == self.mins, 1.0, self.maxs - self.mins)
         logs = self.mins + extent * (levels / _MAX_POSITION)
         with np.errstate(over="ignore"):
-            found: Doubles = np.copysign(np.expm1(np.abs(logs)), logs)
-        return found
+            values: Doubles = np.copysign(np.expm1(np.abs(logs)), logs)
+        return values
 
 
 def _no_harmonics(count: int) -> tuple[Floats, Bytes, Shorts]:
@@ -256,11 +256,11 @@ def _uint16(low: Bytes, high: Bytes) -> Shorts:
 
 def _rgba(colors: Numbers, alpha: Bytes | None = None) -> Bytes:
     """[M, 4] pixels from colours [M, 3], 0 to 255, and an alpha [M], by default 255."""
-    found = np.full((len(colors), 4), 255, np.uint8)
-    found[:, :3] = colors
+    pixels = np.full((len(colors), 4), 255, np.uint8)
+    pixels[:, :3] = colors
     if alpha is not None:
-        found[:, 3] = alpha
-    return found
+        pixels[:, 3] = alpha
+    return pixels
 
 
 def _read_meta(data: bytes) -> _Meta:

@@ -83,7 +83,7 @@ class _Header(NamedTuple):
     def sizes(self) -> list[int]:
         """Bytes in each section: positions, alphas, colours, scales, rotations, harmonics."""
         rotation = 3 if self.version == 2 else 4
-        return [self.gaussians * each for each in (9, 1, 3, 3, rotation, 3 * check_sh_degree(self.sh_degree))]
+        return [self.gaussians * size for size in (9, 1, 3, 3, rotation, 3 * check_sh_degree(self.sh_degree))]
 
     @staticmethod
     def parse(start: bytes, size: int) -> _Header:
@@ -107,9 +107,9 @@ def _gzip(content: bytes, like: bytes) -> bytes:
     """
     header, settings = _GZIP_HEADER, _SETTINGS[0]
     if like.startswith(GZIP) and not like[3]:  # no optional header fields
-        own = zlib.decompress(like, 31)
+        body = zlib.decompress(like, 31)
         header = like[:_GZIP_BYTES]
-        settings = next((each for each in _SETTINGS if _is_packed_with(like, own, each)), settings)
+        settings = next((setting for setting in _SETTINGS if _is_packed_with(like, body, setting)), settings)
     end = struct.pack("<II", zlib.crc32(content), len(content) & 0xFFFFFFFF)
     return header + b"".join(_deflated(content, *settings)) + end
 
@@ -117,10 +117,10 @@ def _gzip(content: bytes, like: bytes) -> bytes:
 def _deflated(content: bytes, level: int, memory: int, block: int) -> Iterator[bytes]:
     """Deflate `content` in independent blocks of `block` bytes, and yield the output in parts."""
     for start in range(0, len(content), block):
-        own = memoryview(content)[start : start + block]
+        rows = memoryview(content)[start : start + block]
         packer = zlib.compressobj(level, zlib.DEFLATED, -zlib.MAX_WBITS, memory)
-        for at in range(0, len(own), _PART):
-            yield packer.compress(own[at : at + _PART])
+        for at in range(0, len(rows), _PART):
+            yield packer.compress(rows[at : at + _PART])
         yield packer.flush(zlib.Z_FINISH if start + block >= len(content) else zlib.Z_SYNC_FLUSH)
 
 
@@ -147,9 +147,9 @@ def _unpack_gzip(data: bytes) -> tuple[_Header, bytes, bytes]:
     except zlib.error as error:
         raise InputError(f"damaged SPZ: {reason(error)}") from error
     if len(body) < size or not stream.eof:
-        found = "cut short" if len(body) < size or not stream.unconsumed_tail else "more than was announced"
+        problem = "cut short" if len(body) < size or not stream.unconsumed_tail else "more than was announced"
         raise InputError(
-            f"not a whole SPZ: expected {size:,} bytes of {header.gaussians:,} Gaussians, found {found}"
+            f"not a whole SPZ: expected {size:,} bytes of {header.gaussians:,} Gaussians, found {problem}"
         )
     return header, body[:size], body[size:] if header.flags & EXTENSIONS else b""
 
@@ -249,15 +249,15 @@ class SpzCodes(Codes):
             parts = np.bitwise_or.reduce(self.rotations.astype(np.uint32) << _ROTATION_SHIFTS, axis=1)
             rotations = (self.largest.astype(np.uint32) << 30 | parts).astype("<u4")
         sections = [fixed, self.alphas, self.colors, self.scales, rotations, self.sh]
-        contents = [each.tobytes() for each in sections if each.size]
+        contents = [section.tobytes() for section in sections if section.size]
         degree, streams = math.isqrt(self.sh.shape[1]), len(contents) if self.version == 4 else 0
         header = _Header(NGSP, self.version, n, degree, self.fractional_bits, self.flags, streams)
         start = _START.pack(*header)
         if self.version < 4:
             return _gzip(b"".join([start, *contents, self.extensions]), self.packed)
         compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
-        packed = [compressor.compress(each) for each in contents]
-        table = [_ENTRY.pack(len(each), len(whole)) for each, whole in zip(packed, contents, strict=True)]
+        packed = [compressor.compress(section) for section in contents]
+        table = [_ENTRY.pack(len(stream), len(whole)) for stream, whole in zip(packed, contents, strict=True)]
         place = _PLACE.pack(_START.size + _PLACE.size + len(self.extensions), bytes(12))
         return b"".join([start, place, self.extensions, *table, *packed])
 
@@ -336,9 +336,9 @@ def _warn_of_clipped_scales(log_scales: Floats) -> None:
 
 def _quantised_harmonics(rest: Floats) -> Bytes:
     """[N, K - 1, 3] codes that are multiples of `_SH_STEPS`, which compresses better."""
-    found = np.empty(rest.shape, np.uint8)
+    levels = np.empty(rest.shape, np.uint8)
     for at in range(rest.shape[1]):  # one by one saves memory
         step = _SH_STEPS[at]
         codes = round_half_away(rest[:, at].astype(np.float64) * _SH_SIGNS[at] * 128) + 128
-        found[:, at] = (np.floor((codes + step // 2) / step) * step).clip(0, 255)
-    return found
+        levels[:, at] = (np.floor((codes + step // 2) / step) * step).clip(0, 255)
+    return levels

@@ -51,7 +51,7 @@ class CompanionTensors:
         """Read a payload. Raises InputError for other data."""
         with refuse_damage(DAMAGED):
             header, tensors = unpack_tensors(payload.data, _Header, FORMAT, VERSION)
-            if any(each.dtype != torch.float32 for each in tensors.values()):
+            if any(tensor.dtype != torch.float32 for tensor in tensors.values()):
                 raise ValueError("expected numbers of single precision")
         return CompanionTensors(tensors, header.frame, header.rows)
 
@@ -59,8 +59,8 @@ class CompanionTensors:
         """The tensors of these names. Raises InputError for others, and for missing ones."""
         expected = list(names)
         if set(expected) != self.tensors.keys():
-            found = ", ".join(sorted(self.tensors))[:200]
-            raise InputError(f"{DAMAGED}: expected {', '.join(expected)}, found {found}")
+            present = ", ".join(sorted(self.tensors))[:200]
+            raise InputError(f"{DAMAGED}: expected {', '.join(expected)}, found {present}")
         return [self.tensors[name] for name in expected]
 
 

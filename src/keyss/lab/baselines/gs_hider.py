@@ -45,9 +45,11 @@ class GsHiderTraining(BaselineTraining):
 
     def gaussians(self) -> Gaussians:
         """The Gaussians, without colours."""
-        own = self.parameters
+        parameters = self.parameters
         sh = torch.zeros(len(self), 1, 3, device=self.device)
-        return Gaussians(own["means"], own["quats"], own["scales"], own["opacities"], sh)
+        return Gaussians(
+            parameters["means"], parameters["quats"], parameters["scales"], parameters["opacities"], sh
+        )
 
     def result(self) -> tuple[Gaussians, CompanionTensors]:
         visible = self.visible()

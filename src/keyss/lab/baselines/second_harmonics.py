@@ -31,7 +31,7 @@ class ShTraining(BaselineTraining):
     def draw(self, scenes: Sequence[int], camera: Camera, sh_degree: int) -> list[Picture]:
         model = to_gaussians(self.parameters)
         models = [replace(model, sh=self.parameters[_NAMES[scene]]) for scene in scenes]
-        return [self.render(*each, camera, sh_degree) for each in zip(models, scenes, strict=True)]
+        return [self.render(*pair, camera, sh_degree) for pair in zip(models, scenes, strict=True)]
 
     def result(self) -> tuple[Gaussians, CompanionTensors]:
         visible, secret_sh = self.visible(), self.parameters[_NAMES[1]].detach()

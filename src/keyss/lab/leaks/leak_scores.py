@@ -158,9 +158,9 @@ def look_for_secret(
     for attack in attacks:
         variants = look(attack, stego)
         of_controls = [look(attack, model) for model in controls]
-        highest = [LeakScores.combine(max, [each for each, _ in shown.values()]) for shown in of_controls]
+        highest = [LeakScores.combine(max, [scores for scores, _ in shown.values()]) for shown in of_controls]
         control = LeakScores.combine(fmean, highest)
-        leaks = {label: own - control for label, (own, _) in variants.items()}
+        leaks = {label: score - control for label, (score, _) in variants.items()}
         best = max(leaks, key=lambda label: leaks[label].evidence())
         scores, picture = variants[best]
         results.append(AttackResult(attack.name, attack.sentence, best, scores, leaks[best]))

@@ -166,7 +166,7 @@ def compare(
     comparison = Comparison(arguments=arguments, methods=tuple(rows))
     write_record(folder.out / f"{STEM}.json", comparison)
     names = [os.path.basename(scene) for scene in scenes]
-    done = {each: outcomes[place] for each, place in places.items() if outcomes[place].result}
+    done = {trial: outcomes[place] for trial, place in places.items() if outcomes[place].result}
     numbers = [TrialNumbers({"method": name}, names, seed, outcome) for (name, seed), outcome in done.items()]
     write_scene_tables(folder.out, STEM, numbers)
     runs = {

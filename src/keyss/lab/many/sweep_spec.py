@@ -79,7 +79,10 @@ def read_spec(path: Path) -> SweepSpec:
     methods = [msgspec.structs.replace(method, name=method.name or method.method) for method in spec.methods]
     spec = msgspec.structs.replace(spec, pairs=tuple(pairs), methods=tuple(methods))
     unique: dict[str, list[Any]] = {"seeds": list(spec.seeds)}
-    unique |= {"pairs": [each.name for each in spec.pairs], "methods": [each.name for each in spec.methods]}
+    unique |= {
+        "pairs": [entry.name for entry in spec.pairs],
+        "methods": [entry.name for entry in spec.methods],
+    }
     for what, values in unique.items():
         if same := [value for value in values if values.count(value) > 1]:  # tables would merge them
             raise InputError(f"{path}: {what}: two are called {same[0]!r}: give one another `name`, or seed")

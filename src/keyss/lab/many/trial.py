@@ -188,7 +188,7 @@ def _hide_arguments(trial: Trial, folder: Path, keys: list[str]) -> dict[str, An
     blank = [""] * len(trial.secrets)  # for methods without keys
     return {
         "cover": trial.cover,
-        "secrets": [Secret(*each) for each in zip(trial.secrets, keys or blank, models, strict=True)],
+        "secrets": [Secret(*secret) for secret in zip(trial.secrets, keys or blank, models, strict=True)],
         "method": trial.options,
         "views": trial.views,
         "cover_model": cover,
@@ -204,7 +204,7 @@ def _place(folder: Path, path: str) -> Path:
 
 def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -> dict[str, float | str]:
     """Numbers of measures, or notes on them."""
-    found: dict[str, float | str] = {}
+    numbers: dict[str, float | str] = {}
     if parts := [name for name in names if name in PARTS]:
         run = folder / RUN
         manifest = read_manifest(run)
@@ -213,7 +213,7 @@ def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -
         more: dict[str, Any] = {"device": trial.device, "overwrite": done, "resume": resume}
         audited = audit(run, keys_of(trial, folder), only=parts, reporter=reporter, **more)
         for part in parts:
-            found |= flat(audited.sections[part].numbers, f"audit.{part}")
+            numbers |= flat(audited.sections[part].numbers, f"audit.{part}")
     if others := [name for name in names if name not in PARTS]:
         device = resolve_device(trial.device)
         with reporter.waiting(f"opening {trial.name}", seconds_for("reveal", stego_in(folder / RUN))):
@@ -222,7 +222,7 @@ def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -
             view = subject.view_seconds
         for name in others:
             with reporter.waiting(f"{trial.name}: {name}", _seconds_of([name], view, len(subject.stego))):
-                found |= {
+                numbers |= {
                     f"{name}.{measure}": value for measure, value in MEASURES[name].numbers(subject).items()
                 }
-    return found
+    return numbers

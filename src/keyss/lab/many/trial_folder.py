@@ -61,7 +61,8 @@ class TrialFolder:
 
     def plain(self, scene: str, config: FitConfig) -> str:
         """Add the plain fit of a scene; returns its model, relative to the folder of another trial."""
-        name = f"plain model of {Path(scene).name}, {config.iterations:,} steps, seed {config.seed}"
+        size = f"{config.iterations:,} steps, {config.max_gaussians:,} Gaussians"
+        name = f"plain model of {Path(scene).name}, {size}, seed {config.seed}"
         shared = {field: self.common[field] for field in ("views", "device")}
         return f"../{self._add(Trial(name=name, cover=scene, options=config, **shared)).name}/{RUN}/{MODEL}"
 

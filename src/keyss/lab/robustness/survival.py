@@ -105,14 +105,14 @@ def measure_robustness(
     results: dict[tuple[str, float], list[ChangeResult]] = {}
     before: list[float] = []
     unchanged = Change("none", 0, "Nothing is changed.", lambda model: model)
-    done, work = 0, sum(_STEPS_TO_MEASURE + each.steps for each in [unchanged, *changes])
-    for each in [unchanged, *changes]:
+    done, work = 0, sum(_STEPS_TO_MEASURE + alteration.steps for alteration in [unchanged, *changes])
+    for alteration in [unchanged, *changes]:
         if progress is not None:
             progress(done, work)
-        done += _STEPS_TO_MEASURE + each.steps
-        result = ChangeResult(each.attack, each.strength, each.sentence)
+        done += _STEPS_TO_MEASURE + alteration.steps
+        result = ChangeResult(alteration.attack, alteration.strength, alteration.sentence)
         try:
-            changed = each(stego)
+            changed = alteration(stego)
         except BackendError as error:
             result = replace(result, skipped=f"{error}")
         else:
@@ -121,7 +121,7 @@ def measure_robustness(
             before = before or [quality.psnr for quality in after]
             lost = [replace(now, loss=was - now.psnr) for now, was in zip(after, before, strict=True)]
             result = replace(result, cover=lost[0], secrets=tuple(lost[1:]))
-        results.setdefault((each.attack, each.strength), []).append(result)
+        results.setdefault((alteration.attack, alteration.strength), []).append(result)
     return [_mean(group) for group in results.values()]
 
 
@@ -137,15 +137,15 @@ def reveal_changed(opener: Opener, stego: Gaussians) -> Gaussians:
 
 def _mean(results: Sequence[ChangeResult]) -> ChangeResult:
     """Average results of different random seeds."""
-    rows = [(each.cover, *each.secrets) for each in results if each.cover is not None]
+    rows = [(result.cover, *result.secrets) for result in results if result.cover is not None]
     if not rows:
         return results[0]
     cover, *secrets = (
         ChangedQuality(
-            fmean(each.psnr for each in qualities),
-            fmean(each.loss for each in qualities),
-            all(each.opens for each in qualities),
-            next((each.error for each in qualities if each.error), None),
+            fmean(quality.psnr for quality in qualities),
+            fmean(quality.loss for quality in qualities),
+            all(quality.opens for quality in qualities),
+            next((quality.error for quality in qualities if quality.error), None),
         )
         for qualities in zip(*rows, strict=True)
     )

@@ -19,6 +19,7 @@ from keyss.lab.stealth.statistic import BitPatterns, Statistic
 DETECTORS = (*low_bits.DETECTORS, *attributes.DETECTORS)
 _AGREEMENT = 0.03  # relative error assumed for a statistic without a known error
 _MANY = 1e7  # degrees of freedom: normal
+_BITS = f"{low_bits.bits.__name__}: "  # prefix of the statistics of single bits, whose variances agree
 
 
 @dataclass(frozen=True)
@@ -67,9 +68,9 @@ def judge(
     """
     if len(controls) < 2:
         raise UsageError(f"expected at least two control models of the scene, got {len(controls)}")
-    own = stealth_statistics(file)
+    statistics = stealth_statistics(file)
     others = [stealth_statistics(model) for model in controls]
-    rows = compare_statistics(own, others)
+    rows = compare_statistics(statistics, others)
     of_controls = (
         compare_statistics(control, others[:index] + others[index + 1 :])
         for index, control in enumerate(others)
@@ -85,27 +86,29 @@ def judge(
 
 
 def compare_statistics(
-    own: Mapping[str, Statistic], controls: Sequence[Mapping[str, Statistic]]
+    statistics: Mapping[str, Statistic], controls: Sequence[Mapping[str, Statistic]]
 ) -> list[JudgedStatistic]:
     """The statistics that all models have, the least likely first."""
-    models = [own, *controls]
+    models = [statistics, *controls]
     samples = {
         name: [control[name] for control in controls]
-        for name in own
+        for name in statistics
         if all(name in model and math.isfinite(model[name].value) for model in models)
     }
     # Variance of the statistics of bits between trainings / sampling variance.
     ratios = [
         _between(others) / _sampling(others)
         for name, others in samples.items()
-        if name.startswith("bits: ") and _sampling(others)
+        if name.startswith(_BITS) and _sampling(others)
     ]
     excess = max(1.0, float(np.mean(ratios))) if ratios else None
     rows = []
     for name, others in samples.items():
         values = [statistic.value for statistic in others]
-        p = _p(own[name], others, excess if name.startswith("bits: ") else None)
-        rows.append(JudgedStatistic(name, own[name].value, min(values), max(values), p, own[name].p))
+        p = _p(statistics[name], others, excess if name.startswith(_BITS) else None)
+        rows.append(
+            JudgedStatistic(name, statistics[name].value, min(values), max(values), p, statistics[name].p)
+        )
     return sorted(rows, key=lambda row: row.p)
 
 
@@ -114,7 +117,7 @@ def least_p(rows: Sequence[JudgedStatistic]) -> float:
     return min(1.0, rows[0].p * len(rows)) if rows else 1.0
 
 
-def _p(own: Statistic, controls: Sequence[Statistic], excess: float | None) -> float:
+def _p(judged: Statistic, controls: Sequence[Statistic], excess: float | None) -> float:
     """Two-sided p of one more value by Student's t, with degrees of freedom by Welch and Satterthwaite.
 
     Variance between controls and sampling variance add up. Few controls estimate the former poorly: if
@@ -123,18 +126,18 @@ def _p(own: Statistic, controls: Sequence[Statistic], excess: float | None) -> f
     """
     count = len(controls)
     mean = float(np.mean([statistic.value for statistic in controls]))
-    distance = abs(own.value - mean)
+    distance = abs(judged.value - mean)
     if distance == 0:
         return 1.0
     between, sampling = _between(controls), _sampling(controls)
-    sampling_own = (own.error or 0.0) ** 2
+    sampling_judged = (judged.error or 0.0) ** 2
     if excess is not None and between <= 3 * excess * sampling:
-        variance, degrees = excess * (sampling_own + sampling / count), _MANY
+        variance, degrees = excess * (sampling_judged + sampling / count), _MANY
     else:
         # Few controls may agree by chance, and a constant statistic has no variance.
-        floor = (_AGREEMENT * max(abs(mean), 1e-3)) ** 2 if sampling + sampling_own == 0 else 0.0
+        floor = (_AGREEMENT * max(abs(mean), 1e-3)) ** 2 if sampling + sampling_judged == 0 else 0.0
         unknown = between * (1 + 1 / count) + floor
-        variance = unknown + sampling_own + sampling / count
+        variance = unknown + sampling_judged + sampling / count
         degrees = min(_MANY, (count - 1) * variance**2 / max(unknown, 1e-150) ** 2)
     return float(2 * stdtr(degrees, -distance / math.sqrt(variance)))
 

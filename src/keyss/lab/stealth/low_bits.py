@@ -78,24 +78,24 @@ def bits(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     statistics: dict[str, Statistic] = {}
     for index, attribute in enumerate(ATTRIBUTES):
         columns = words.of_attribute(index)
-        own = words.bits[:, columns][words.trained[:, columns]]
-        if len(own):
-            statistics |= {f"{name}, {attribute}": statistic for name, statistic in _of_values(own).items()}
-            statistics[f"strata of {attribute}"] = _strata(own)
+        bits = words.bits[:, columns][words.trained[:, columns]]
+        if len(bits):
+            statistics |= {f"{name}, {attribute}": statistic for name, statistic in _of_values(bits).items()}
+            statistics[f"strata of {attribute}"] = _strata(bits)
     harmonics = words.attribute >= _HARMONICS
-    own, trained = words.bits[:, harmonics], words.trained[:, harmonics]
+    bits, trained = words.bits[:, harmonics], words.trained[:, harmonics]
     exponent = words.exponent[:, harmonics]
     for magnitude, (low, high) in MAGNITUDES.items():
-        values = own[trained & (exponent >= low) & (exponent < high)]
+        values = bits[trained & (exponent >= low) & (exponent < high)]
         statistics |= {
             f"{name}, {magnitude} harmonics": statistic for name, statistic in _of_values(values).items()
         }
     small = trained & (exponent < MAGNITUDES["middling"][1])
-    statistics["zeros together in a Gaussian"] = _count_variance(own, small)
+    statistics["zeros together in a Gaussian"] = _count_variance(bits, small)
     tiny = (trained & (exponent < MAGNITUDES["tiny"][1])).any(axis=1)
     for name, rows in (("with", tiny), ("without", ~tiny)):
-        found = _of_values(own[rows][trained[rows]])["ones in bits 1-3"]
-        statistics[f"Gaussians with tiny harmonics, ones in bits 1-3 {name}"] = found
+        ones = _of_values(bits[rows][trained[rows]])["ones in bits 1-3"]
+        statistics[f"Gaussians with tiny harmonics, ones in bits 1-3 {name}"] = ones
     return statistics
 
 
@@ -355,7 +355,7 @@ def _follow(own: Words32, pairs: Integers, moved: Doubles, least: int) -> _Candi
 def _joined(candidates: list[_Candidates]) -> _Candidates:
     index, number = np.zeros(0, np.int64), np.zeros(0)
     every = [(np.zeros((0, 2), np.int64), index, number, index, number), *candidates]
-    return tuple(np.concatenate(each)[:_MAX_DIFFERENCES] for each in zip(*every, strict=True))  # type: ignore[return-value]
+    return tuple(np.concatenate(columns)[:_MAX_DIFFERENCES] for columns in zip(*every, strict=True))  # type: ignore[return-value]
 
 
 def _excess(

@@ -98,8 +98,9 @@ def excess(hits: int, trials: int, expected: float) -> Statistic:
 
 
 def portion(hits: float, trials: int) -> Statistic:
-    """A share without a null hypothesis."""
-    return Statistic(hits / max(trials, 1), math.sqrt(max(hits, 1.0)) / max(trials, 1))
+    """A share without a null hypothesis, with the binomial error of at least one hit and one miss."""
+    trials = max(trials, 1)
+    return Statistic(hits / trials, math.sqrt(max(hits, 1.0) * max(trials - hits, 1.0) / trials) / trials)
 
 
 def near_misses(distance: Numbers, equal: Flags, moved: float, around: float) -> Statistic:

@@ -25,15 +25,16 @@ class SecretSize:
     count: int  # Gaussians
     usual: int  # bytes of its payload with the usual precision
     finest: int
+    sh_degree: int
     fitted: bool
 
     @staticmethod
     def of(model: Gaussians | None, fit: FitConfig) -> SecretSize:
         """The size of `model`, or of what `fit` will give."""
         if model is not None:
-            return SecretSize(len(model), usual_size(model), finest_size(model), True)
+            return SecretSize(len(model), usual_size(model), finest_size(model), model.sh_degree, True)
         usual, finest = (fit.max_gaussians * bits // 8 for bits in _BITS_PER_GAUSSIAN)
-        return SecretSize(fit.max_gaussians, usual, finest, False)
+        return SecretSize(fit.max_gaussians, usual, finest, fit.sh_degree, False)
 
 
 def check_appended(model: Gaussians) -> None:
@@ -73,7 +74,7 @@ class CarryCapacity:
         return CarryCapacity(len(cover), cover.sh_degree, channel, prepared.capacity, prepared)
 
     def sizes(self, secrets: Sequence[SecretSize]) -> list[int]:
-        """The number of Gaussians of each secret that fit; an estimate where not all do.
+        """The number of Gaussians of each secret that fit at its SH degree; an estimate where not all do.
 
         Raises UsageError if the cover is too small.
         """

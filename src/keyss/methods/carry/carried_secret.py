@@ -24,9 +24,9 @@ class CarriedSecret(HiddenScene):
     @staticmethod
     def of(payload: Payload) -> CarriedSecret:
         """Read a payload. Raises InputError for damage."""
-        found = CarriedSecret(payload)
-        _ = found.gaussians
-        return found
+        secret = CarriedSecret(payload)
+        _ = secret.gaussians
+        return secret
 
     @cached_property
     def gaussians(self) -> Gaussians:

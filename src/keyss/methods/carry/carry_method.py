@@ -36,8 +36,10 @@ from keyss.rendering.orbit import Viewpoints
 # Fine-tuning to renders starts near the optimum: maximum steps, and factor on the rates.
 _MODEL_ITERATIONS, _MODEL_RATE = 400, 0.1
 _SELECTION_VIEWS = 64
-_FINE_TUNED_SHARE = 0.97  # Gaussians after fine-tuning / that fit: they compress a little worse then
-_MIN_SHARE = 1 / 6  # of a secret's Gaussians; public models fine-tuned with fewer are below 30 dB
+_FINE_TUNED_SHARE = 0.97  # of the Gaussians that fit are kept, since fine-tuned ones compress a little worse
+# Least shares of a secret's Gaussians. Public models fine-tuned with fewer are below 30 dB; with fewer than
+# the second, and than so many Gaussians, below 20 dB or as far from the plain model as empty renders.
+_MIN_SHARE, _HOPELESS_SHARE, _HOPELESS = 1 / 6, 1 / 100, 500
 
 
 class CarryMethod:
@@ -63,8 +65,15 @@ class CarryMethod:
         def fit_in(channel: Channel) -> tuple[CarryCapacity, list[int]]:
             capacity = CarryCapacity.of(channel, cover.given, options.fit)
             counts = capacity.sizes(secret_sizes)
-            if cover.given is not None and not (channel.grows or options.publish or options.format):
-                _check_share(secret_sizes, counts)
+            chosen_by_user = options.publish or options.format
+            for size, count in zip(secret_sizes, counts, strict=True):
+                hopeless = count < min(_HOPELESS, _HOPELESS_SHARE * size.count)
+                known = cover.given is not None and size.fitted
+                if hopeless or (known and not chosen_by_user and count < _MIN_SHARE * size.count):
+                    most = "" if size.fitted else "up to "
+                    raise UsageError(
+                        f"a secret of {most}{size.count:,} Gaussians would be cut down to about {count:,}"
+                    )
             return capacity, counts
 
         capacity, counts = chosen.in_channel(cover.given, fit_in)
@@ -80,12 +89,15 @@ class CarryMethod:
             )
         ]
         appended = capacity.appended(secret_sizes)
+        pruned = any(
+            count < size.count and size.sh_degree for size, count in zip(secret_sizes, counts, strict=True)
+        )
         plan = Plan(
             gaussians=capacity.gaussians + appended,
             sh_degree=capacity.sh_degree,
             secret_gaussians=sum(secret.count for secret in secret_sizes),
             capacity=sum(counts),
-            notes=(_note(capacity, appended),),
+            notes=(_note(capacity, appended, pruned=pruned),),
         )
         return Prepared(
             options=options,
@@ -94,7 +106,7 @@ class CarryMethod:
             plan=plan,
             grows=capacity.channel.grows,
             survives=capacity.channel.survives,
-            carrier=capacity,
+            capacity=capacity,
         )
 
     def hide(self, sources: Sequence[Source], prepared: Prepared, context: Context) -> Stego:
@@ -104,7 +116,7 @@ class CarryMethod:
         checkpoint of another run.
         """
         cover, *secrets = sources
-        capacity: CarryCapacity = prepared.carrier
+        capacity: CarryCapacity = prepared.capacity
         assert capacity.prepared is not None  # the cover is fitted
         plain = [secret.model for secret in secrets]
         viewpoints = [Viewpoints.of(secret.scene) for secret in secrets]
@@ -151,22 +163,16 @@ def _fine_tuning_steps(
     return steps
 
 
-def _check_share(secrets: Sequence[SecretSize], counts: Sequence[int]) -> None:
-    """Raise UsageError for given secrets that would keep less than _MIN_SHARE of their Gaussians."""
-    for secret, count in zip(secrets, counts, strict=True):
-        if secret.fitted and count < _MIN_SHARE * secret.count:
-            raise UsageError(f"a secret of {secret.count:,} Gaussians would be cut down to {count:,}")
-
-
-def _note(capacity: CarryCapacity, appended: int) -> str:
-    """What is appended, or the capacity."""
+def _note(capacity: CarryCapacity, appended: int, *, pruned: bool) -> str:
+    """What is appended, or the capacity; `pruned`: of secrets with harmonics that do not fit."""
     if appended:
         return (
             f"up to {appended:,} invisible Gaussians are appended to the cover's {capacity.gaussians:,}; "
             "fewer Gaussians or a lower SH degree of a secret take less"
         )
     how = "about" if capacity.prepared is None else "exactly"
-    return f"the {capacity.channel.place} have room for {how} {capacity.payloads.bytes:,} bytes"
+    flatter = "; a secret keeps more Gaussians if a lower SH degree shows more of it" * pruned
+    return f"the {capacity.channel.place} have room for {how} {capacity.payloads.bytes:,} bytes{flatter}"
 
 
 METHOD = CarryMethod()

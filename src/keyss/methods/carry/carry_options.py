@@ -13,7 +13,10 @@ FINE_TUNING = 1.15  # fine-tuning steps / fit steps, with photos; at 1, secrets 
 
 @dataclass(frozen=True, kw_only=True)
 class CarryOptions(MethodOptions):
-    """Options of `carry`; `fit` is for plain models, and fine-tuning adds FINE_TUNING times its steps."""
+    """Options of `carry`; `fit` is for plain models, and fine-tuning adds FINE_TUNING times its steps.
+
+    Plain models of secrets that need no fine-tuning have those steps too, unless `iterations` is given.
+    """
 
     method: ClassVar[str] = "carry"
 
@@ -34,7 +37,9 @@ class CarryOptions(MethodOptions):
         return self.fine_tune != "never"
 
     def fits(self, scenes: int) -> list[FitConfig]:
-        """Secrets get the steps of fine-tuning in addition, which they do without."""
+        """By default, secrets get the steps of fine-tuning in addition, which they do without."""
+        if self.iterations is not None:
+            return [self.fit] * scenes
         secret = replace(self.fit, iterations=round((1 + FINE_TUNING) * self.fit.iterations))
         return [self.fit] + [secret] * (scenes - 1)
 

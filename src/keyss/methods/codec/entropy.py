@@ -121,25 +121,27 @@ def _code(table: Any, shares: Any, groups: Any, data: Any, reading: bool, estima
             value = abs(difference)
             context = min(_CONTEXTS - 1, (sizes[column] + recent) >> 2)
             group = groups[column]
-            own = estimates[group, context]
+            estimate = estimates[group, context]
             size = context // 3
-            low, scope, at, more = _bit(low, scope, at, data, reading, value >> size > 0, own[size])
+            low, scope, at, more = _bit(low, scope, at, data, reading, value >> size > 0, estimate[size])
             if more:
                 size += 1
                 while size < _MAX_BITS and more:
-                    low, scope, at, more = _bit(low, scope, at, data, reading, value >> size > 0, own[size])
+                    low, scope, at, more = _bit(
+                        low, scope, at, data, reading, value >> size > 0, estimate[size]
+                    )
                     size += more
             else:
                 while size > 0 and not more:
                     low, scope, at, more = _bit(
-                        low, scope, at, data, reading, value >> (size - 1) > 0, own[size - 1]
+                        low, scope, at, data, reading, value >> (size - 1) > 0, estimate[size - 1]
                     )
                     size -= 1 - more
             if size > 0:
-                found, left = 1, 1  # bits of equal probability: all but two, and the sign
+                decoded, left = 1, 1  # bits of equal probability: all but two, and the sign
                 if size > 1:
                     left = size - 1
-                    low, scope, at, found = _bit(
+                    low, scope, at, decoded = _bit(
                         low,
                         scope,
                         at,
@@ -148,7 +150,7 @@ def _code(table: Any, shares: Any, groups: Any, data: Any, reading: bool, estima
                         value >> (size - 2) & 1,
                         estimates[group, _CONTEXTS, size],
                     )
-                    found += 2
+                    decoded += 2
                 flat = (value << 1 | (difference < 0)) & ((1 << left) - 1)
                 while left > 0:
                     some = min(left, _FLAT_BITS)
@@ -159,8 +161,8 @@ def _code(table: Any, shares: Any, groups: Any, data: Any, reading: bool, estima
                         part = min(low // scope, (1 << some) - 1)
                     low += -part * scope if reading else part * scope
                     low, scope, at = _renormalise(low, scope, at, data, reading)
-                    found = found << some | part
-                difference = -(found >> 1) if found & 1 else found >> 1
+                    decoded = decoded << some | part
+                difference = -(decoded >> 1) if decoded & 1 else decoded >> 1
             else:
                 difference = 0
             before[column] = predicted + difference

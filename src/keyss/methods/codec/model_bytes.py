@@ -79,7 +79,7 @@ class Precision:
     def steps(self) -> list[float]:
         """The steps as stored: float32, clamped."""
         steps = np.array([getattr(self, field.name) for field in fields(self)], np.float32)
-        return [float(each) for each in steps.clip(1e-12, _MAX_STEP)]
+        return [float(step) for step in steps.clip(1e-12, _MAX_STEP)]
 
 
 def encode(model: Gaussians, precision: Precision | None = None) -> bytes:
@@ -124,7 +124,7 @@ class _Encoder:
             np.median(model.opacity_logits.numpy()[some]),
         ]
         limits = [*[MAX_COORDINATE] * 3, MAX_LOG_SCALE, _MAX_LOGIT]
-        centres = [float(np.clip(each, -most, most)) for each, most in zip(middle, limits, strict=True)]
+        centres = [float(np.clip(centre, -most, most)) for centre, most in zip(middle, limits, strict=True)]
         steps = (precision or Precision.usual(model)).steps
         coder = _Encoder(model, order, model.overflow.numpy(), centres, steps)
         _, log_scales, logits, _ = _uniform_numbers(coder._uniform_codes(some), centres, steps)
@@ -157,8 +157,8 @@ class _Encoder:
         become transparent.
         """
         means, log_scales, logits, colours = (
-            doubles(each[rows])
-            for each in (
+            doubles(tensor[rows])
+            for tensor in (
                 self.model.means,
                 self.model.log_scales,
                 self.model.opacity_logits[:, None],
@@ -185,7 +185,9 @@ def decode(data: bytes, model_size: int | None = None) -> Gaussians:
         raise InputError("the hidden secret is damaged: it is too short")
     count, sh_degree, *numbers = _HEAD.unpack_from(data)
     centres, steps, typical = numbers[:5], numbers[5:11], numbers[11]
-    bounded = all(abs(each) < 1e30 for each in (*centres, typical)) and all(0 < s <= _MAX_STEP for s in steps)
+    bounded = all(abs(number) < 1e30 for number in (*centres, typical)) and all(
+        0 < s <= _MAX_STEP for s in steps
+    )
     if not (count > 0 and sh_degree <= 3 and bounded):
         raise InputError(
             f"the hidden secret is damaged: it declares {count:,} Gaussians of SH degree {sh_degree}"
@@ -211,16 +213,16 @@ def decode(data: bytes, model_size: int | None = None) -> Gaussians:
         block = start // BLOCK
         coded = data[ends[block] - sizes[block] : ends[block]]
         codes = entropy.decode(coded, stop - start, *columns)
-        own = slice(start, stop)
+        rows = slice(start, stop)
         uniform = _uniform_numbers(codes[:, :10], centres, steps)
-        means[own], log_scales[own], logits[own] = uniform[:3]
+        means[rows], log_scales[rows], logits[rows] = uniform[:3]
         finer = _refinement(uniform[1], uniform[2], typical)
         x, y, z = (codes[:, 10:13] * _steps(steps[4], finer)).T
         w = np.sqrt(np.maximum(1 - (x * x + y * y + z * z), _LEAST_W))
-        quats[own] = np.stack([w, x, y, z], axis=1)
-        sh[own, :1] = _from_opponents(uniform[3][:, None])
+        quats[rows] = np.stack([w, x, y, z], axis=1)
+        sh[rows, :1] = _from_opponents(uniform[3][:, None])
         harmonics = codes[:, 13:] * _steps(steps[5], finer)
-        sh[own, 1:] = _from_opponents(harmonics.reshape(len(codes), -1, 3))
+        sh[rows, 1:] = _from_opponents(harmonics.reshape(len(codes), -1, 3))
 
     in_blocks(fill, count, BLOCK, entropy.read)
     return Gaussians(*map(torch.from_numpy, (means, quats, log_scales, logits, sh)))
@@ -267,25 +269,25 @@ def _from_opponents(parts: Numbers) -> Numbers:
 
 def _transformed(values: Numbers, matrix: Doubles) -> Numbers:
     """`values` [..., 3] @ matrix.T in a fixed order of operations."""
-    found = np.empty_like(values)
+    products = np.empty_like(values)
     for at, (a, b, c) in enumerate(matrix.tolist()):
-        found[..., at] = a * values[..., 0] + b * values[..., 1] + c * values[..., 2]
-    return found
+        products[..., at] = a * values[..., 0] + b * values[..., 1] + c * values[..., 2]
+    return products
 
 
 def _weight(log_scales: Doubles, logits: Doubles) -> Doubles:
     """Logarithms [N] of weights."""
     scales = np.sort(log_scales, axis=1)
     # log(opacity) is about min(logit, 0)
-    found: Doubles = scales[:, 2] + scales[:, 1] + 2 * np.minimum(logits, 0)
-    return found
+    visibility: Doubles = scales[:, 2] + scales[:, 1] + 2 * np.minimum(logits, 0)
+    return visibility
 
 
 def _refinement(log_scales: Doubles, logits: Doubles, typical: float) -> Integers:
     """Half octaves [N] by which the other steps of each Gaussian are finer than those of typical ones."""
     octaves = (_weight(log_scales, logits) - typical) * _PER_OCTAVE
-    found: Integers = np.floor(octaves + 0.5).astype(np.int64)
-    return found.clip(-_FINER, _FINER)
+    whole: Integers = np.floor(octaves + 0.5).astype(np.int64)
+    return whole.clip(-_FINER, _FINER)
 
 
 def _steps(step: float, finer: Integers) -> Doubles:

@@ -60,13 +60,13 @@ def prune_to_size(model: Gaussians, max_bytes: int, viewpoints: Viewpoints | Non
         return model
     candidates = []
     for degree in range(model.sh_degree + 1):
-        own = kept = model.with_sh_degree(degree)
+        truncated = kept = model.with_sh_degree(degree)
         while len(kept) and (size := encoded_size(kept)) > max_bytes:
-            kept = most_visible(own, min(len(kept) - 1, int(0.995 * len(kept) * max_bytes / size)))
+            kept = most_visible(truncated, min(len(kept) - 1, int(0.995 * len(kept) * max_bytes / size)))
         candidates += [kept] if len(kept) else []
     if not candidates:
         raise UsageError(f"nothing of a secret fits into {max_bytes:,} bytes")
-    return max(candidates, key=lambda each: psnr_between(model, each, viewpoints))
+    return max(candidates, key=lambda candidate: psnr_between(model, candidate, viewpoints))
 
 
 def usual_size(model: Gaussians) -> int:

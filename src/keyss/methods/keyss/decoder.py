@@ -26,9 +26,9 @@ class Decoder(nn.Module):
         self.shape = shape
         first, second = shape.hidden
         self.common = nn.ModuleList([nn.Linear(shape.inputs, first), nn.Linear(first, second)])
-        self.inner = nn.ModuleDict({each: nn.Linear(second, shape.branch) for each in shape.mask})
+        self.inner = nn.ModuleDict({name: nn.Linear(second, shape.branch) for name in shape.mask})
         self.outer = nn.ModuleDict(
-            {each: nn.Linear(shape.branch, shape.channels(each)) for each in shape.mask}
+            {name: nn.Linear(shape.branch, shape.channels(name)) for name in shape.mask}
         )
         for layer in linear(self.modules()) if shape.released else ():
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
@@ -41,7 +41,7 @@ class Decoder(nn.Module):
         """Decode `cover`, which may be a part of `whole`."""
         inputs = torch.cat(self.normalize(cover, whole or cover), dim=1)
         residuals = Mlp.apply(inputs, *self.layers(key))  # type: ignore[no-untyped-call]
-        sizes = [self.shape.channels(each) for each in self.shape.mask]
+        sizes = [self.shape.channels(name) for name in self.shape.mask]
         return self.add_residuals(cover, dict(zip(self.shape.mask, residuals.split(sizes, 1), strict=True)))
 
     def layers(self, key: Tensor) -> list[Tensor]:
@@ -55,8 +55,11 @@ class Decoder(nn.Module):
         return [
             *(weights, first.bias + of_key @ F.normalize(key, dim=0)),
             *(second.weight, second.bias),
-            *(torch.cat([each.weight for each in inner]), torch.cat([each.bias for each in inner])),
-            *(torch.block_diag(*(each.weight for each in outer)), torch.cat([each.bias for each in outer])),
+            *(torch.cat([layer.weight for layer in inner]), torch.cat([layer.bias for layer in inner])),
+            *(
+                torch.block_diag(*(layer.weight for layer in outer)),
+                torch.cat([layer.bias for layer in outer]),
+            ),
         ]
 
     def normalize(self, cover: Gaussians, whole: Gaussians) -> list[Tensor]:
@@ -86,7 +89,7 @@ class Decoder(nn.Module):
 
 def linear(modules: Iterable[nn.Module]) -> list[nn.Linear]:
     """The linear layers among `modules`."""
-    return [each for each in modules if isinstance(each, nn.Linear)]
+    return [module for module in modules if isinstance(module, nn.Linear)]
 
 
 class Mlp(torch.autograd.Function):
@@ -104,17 +107,17 @@ class Mlp(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, ...]:
         inputs, *layers = ctx.saved_tensors
-        of_inputs, found = torch.zeros_like(inputs), [torch.zeros_like(each) for each in layers]
+        of_inputs, of_layers = torch.zeros_like(inputs), [torch.zeros_like(layer) for layer in layers]
         for rows in upstream.any(1).nonzero()[:, 0].split(ROWS):
             gradient, values = upstream[rows], activations(inputs[rows], layers[:-2])
             for index, value in reversed(list(enumerate(values))):
-                found[2 * index].addmm_(gradient.T, value)
-                found[2 * index + 1] += gradient.sum(0)
+                of_layers[2 * index].addmm_(gradient.T, value)
+                of_layers[2 * index + 1] += gradient.sum(0)
                 gradient = gradient @ layers[2 * index]
                 if index:
                     gradient *= value > 0
             of_inputs[rows] = gradient
-        return of_inputs, *found
+        return of_inputs, *of_layers
 
 
 def activations(rows: Tensor, layers: Sequence[Tensor]) -> list[Tensor]:

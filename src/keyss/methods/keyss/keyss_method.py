@@ -88,7 +88,7 @@ class KeyssMethod:
         Warns (KeyssWarning) if density control added nothing. Raises Interrupted on Ctrl-C, and InputError
         for a checkpoint of another run.
         """
-        options, keys = prepared.options, [each.key for each in sources[1:]]
+        options, keys = prepared.options, [source.key for source in sources[1:]]
         entropy = context.entropy or os.urandom(32)
         if encoder := _encoder(options):
             vectors = [encoder(key) for key in keys]
@@ -106,12 +106,12 @@ class KeyssMethod:
         keyed = list(zip(keys, payloads, strict=True))
         details: dict[str, Any] = {}
         try:
-            found = LOW_BITS.prepare(stego).embed(keyed, entropy=entropy)
+            embedded = LOW_BITS.prepare(stego).embed(keyed, entropy=entropy)
         except KeyssError as error:
-            found = APPENDED.prepare(stego).embed(keyed, entropy=entropy)
+            embedded = APPENDED.prepare(stego).embed(keyed, entropy=entropy)
             warnings.warn(f"method keyss: {error}; {_APPENDED}", KeyssWarning, stacklevel=2)
             details["appended_because"] = str(error)
-        return Stego(found, tuple(map(KeyssSecret.of, payloads)), run.iterations, details)
+        return Stego(embedded, tuple(map(KeyssSecret.of, payloads)), run.iterations, details)
 
 
 def _encoder(options: KeyssOptions) -> ClipKeys | None:
@@ -195,8 +195,8 @@ class KeyssSecret(HiddenScene):
         Appended Gaussians are left out: they were added after the training.
         """
         decoder: Decoder = self.decoder.to(stego.device)
-        own = stego[~is_appended(stego)].with_sh_degree(decoder.shape.sh_degree)
-        return decoder(own, key.to(stego.device))  # type: ignore[no-any-return]
+        decodable = stego[~is_appended(stego)].with_sh_degree(decoder.shape.sh_degree)
+        return decoder(decodable, key.to(stego.device))  # type: ignore[no-any-return]
 
     def recovered(self, revealed: Gaussians) -> Recovered:
         """See `HiddenScene.recovered`; Gaussians that are never rendered do not count."""
@@ -215,11 +215,11 @@ class KeyssSecret(HiddenScene):
         means = stego.means.detach().double().cpu().numpy()
         size = float(np.ptp(means, axis=0).max())
         distances, _ = cKDTree(means).query(self.anchors.double().numpy())
-        found = float((distances <= ANCHOR_TOLERANCE * size).mean())
-        if found < ANCHORS_NEEDED:
+        share = float((distances <= ANCHOR_TOLERANCE * size).mean())
+        if share < ANCHORS_NEEDED:
             raise InputError(
                 "the model was moved or rounded since its decoder was trained, or it is another one: "
-                f"{found:.0%} of the decoder's anchors are there, at least {ANCHORS_NEEDED:.0%} expected "
+                f"{share:.0%} of the decoder's anchors are there, at least {ANCHORS_NEEDED:.0%} expected "
                 "(`force=True` tries all the same)"
             )
 

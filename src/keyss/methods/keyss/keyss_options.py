@@ -54,7 +54,7 @@ class DecoderShape:
     def weights(self) -> int:
         """Number of weights, without biases."""
         first, second = self.hidden
-        branches = sum(self.branch * (second + self.channels(each)) for each in self.mask)
+        branches = sum(self.branch * (second + self.channels(name)) for name in self.mask)
         return self.inputs * first + first * second + branches
 
 

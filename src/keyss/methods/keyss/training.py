@@ -92,11 +92,11 @@ class CombinedPoses:
 
     def target(self, scene: int, owner: int, index: int) -> Target:
         """The target of `scene` at training pose `index` of `owner`."""
-        own = self.scenes[owner].scene.train[index] if scene == owner else None
+        photo = self.scenes[owner].scene.train[index] if scene == owner else None
 
         def make() -> Target:
-            image = own.image if own else self._render(scene, owner, index)
-            return Target.of(image.to(self.device), own.mask if own else None)
+            image = photo.image if photo else self._render(scene, owner, index)
+            return Target.of(image.to(self.device), photo.mask if photo else None)
 
         return self._targets.of((scene, owner, index), make)
 
@@ -190,8 +190,8 @@ class KeyssTraining(TrainingRun):
         alone = [not shared and scene in self.owners for scene in range(len(self.scenes))]
         common = [] if all(alone) else [self.combined[self.shuffles["combined"].sample()]]
         return [
-            (scene, self.shuffles[f"photos.{scene}"].sample()) if own else common[0]
-            for scene, own in enumerate(alone)
+            (scene, self.shuffles[f"photos.{scene}"].sample()) if has_own else common[0]
+            for scene, has_own in enumerate(alone)
         ]
 
     def wrong_key(self) -> Tensor | None:
@@ -209,7 +209,7 @@ class KeyssTraining(TrainingRun):
         drawn: dict[int, Picture] = {}
         weights: dict[int, float] = {}  # by render: baselines render scenes together
         for pose in dict.fromkeys(poses):
-            scenes = [scene for scene, own in enumerate(poses) if own == pose]
+            scenes = [scene for scene, scene_pose in enumerate(poses) if scene_pose == pose]
             pictures = self.draw(scenes, self.poses.camera(*pose), degree)
             for scene, picture in zip(scenes, pictures, strict=True):
                 target, beta = self.poses.target(scene, *pose), self.betas[scene]
@@ -226,7 +226,7 @@ class KeyssTraining(TrainingRun):
         released = self.design.decoder.released
         growing = [drawn[scene] for scene in self.growing]
         return total, [
-            (each.meta, each.indices, 1.0 if released else weights[id(each.meta)]) for each in growing
+            (render.meta, render.indices, 1.0 if released else weights[id(render.meta)]) for render in growing
         ]
 
     def cover(self) -> Gaussians:
@@ -266,10 +266,10 @@ class KeyssTraining(TrainingRun):
     @torch.no_grad()
     def evaluate(self) -> dict[str, float]:
         """Mean PSNR of each scene on held-out views."""
-        found = {}
+        means = {}
         for scene, placed in enumerate(self.scenes):
             views = subsample_views(placed.scene.test, 8)
-            found[role_of(scene, len(self.scenes))] = fmean(
+            means[role_of(scene, len(self.scenes))] = fmean(
                 psnr(
                     self.draw([scene], view.camera, self.fit.sh_degree)[0].image,
                     view.photo(self.device),
@@ -277,7 +277,7 @@ class KeyssTraining(TrainingRun):
                 )
                 for view in views
             )
-        return found
+        return means
 
     @torch.no_grad()
     def opacity_for_pruning(self) -> Tensor:

@@ -322,7 +322,7 @@ def _blend_tile_backward(
                         sum_green = multiply_add(weight, gradient_green, sum_green)
                         sum_blue = multiply_add(weight, gradient_blue, sum_blue)
                         product = multiply_add(gradient_green, green, gradient_blue * blue)
-                        own = weight * multiply_add(gradient_red, red, product)
+                        emitted = weight * multiply_add(gradient_red, red, product)
                     else:
                         store8(weights, k, weight)
                         product = zero
@@ -330,11 +330,11 @@ def _blend_tile_backward(
                             value = at(features, g // PACKED * channels + channel)
                             gradient = load8(planes, k + (2 + channel) * TILE_PIXELS)
                             product = multiply_add(gradient, value, product)
-                        own = weight * product
-                    behind = load8(planes, k + TILE_PIXELS) - own
+                        emitted = weight * product
+                    behind = load8(planes, k + TILE_PIXELS) - emitted
                     store8(planes, k + TILE_PIXELS, behind)
                     # alpha dL/d(alpha); the light from behind is dimmed by 1 - alpha.
-                    s = own - behind * divide(alpha, SCALE - alpha)
+                    s = emitted - behind * divide(alpha, SCALE - alpha)
                     s = select_ge(SCALED_ALPHA_MAX, footprint, s, ZERO)
                     footprint = footprint * ratio
                     ratio = ratio * decay

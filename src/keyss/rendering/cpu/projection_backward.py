@@ -124,10 +124,10 @@ def _sum_pairs(
         i = at(ids, start + lane)
         first = np.int64(at(first_slots, i))
         after = first + at(slot_counts, i)
-        own = splat(ZERO)
+        moments_sum = splat(ZERO)
         for slot in range(first, after):
-            own = own + load8(moments, slot * MOMENTS)
-        store8(sums, 8 * lane, own)
+            moments_sum = moments_sum + load8(moments, slot * MOMENTS)
+        store8(sums, 8 * lane, moments_sum)
         for extra in range(extra_width):
             total = ZERO
             for slot in range(first, after):

@@ -193,9 +193,9 @@ def fused_multiply_add(typingctx, a, b, c):
 
     def codegen(context, builder, signature, arguments):
         # With `afn` or `contract`, LLVM would emit a product and a sum on these, which round twice.
-        found = builder.fma(*arguments)
-        found.fastmath = _NoFlags()
-        return found
+        value = builder.fma(*arguments)
+        value.fastmath = _NoFlags()
+        return value
 
     return types.float32(types.float32, types.float32, types.float32), codegen
 
