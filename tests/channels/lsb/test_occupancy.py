@@ -22,7 +22,7 @@ CARRIERS, LAYOUT = 4000, Layout(3)
 IDS = np.random.default_rng(0).integers(0, 256, (CARRIERS, 16), np.uint8)
 OWN = keys(0)
 HIDINGS = 40
-CAPACITY = LowBitsCapacity(CARRIERS, CARRIERS, LAYOUT, (LEAST,))
+CAPACITY = LowBitsCapacity(CARRIERS, CARRIERS, LAYOUT, LEAST)
 QUARTER = CAPACITY.for_payloads().shares[0][1]  # bytes that fit into a quarter of these carriers
 THIRD = CAPACITY.for_payloads().equal(3)  # bytes that fit into equal shares of three
 

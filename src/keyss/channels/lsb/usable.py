@@ -7,7 +7,7 @@ A Gaussian is excluded as a whole, so that its numbers stay consistent, because 
   of Gaussians that no view shows, and numbers that training freezes in clones.
 - *Copies*: Gaussians that share their position, scales, quaternion or the harmonics of degree 1 of a colour
   with any other one, and values that occur too often.
-- *Nearly equal* colours of a harmonic: grey Gaussians.
+- *Nearly equal* scales, or colours of a harmonic: round and grey Gaussians.
 - *Opacities* whose sigmoid is 1, which have no gradient, and those at the edge below which trainers remove
   Gaussians: no trained model has smaller ones.
 - *Unit quaternions* among others, as in merged models: new bits would change their length.
@@ -233,9 +233,9 @@ def _without_copies(gaussians: Gaussians, layout: Layout, ids: Bytes) -> Flags:
         good[:, _OPACITY] &= opacity | LOW != _PRUNED
         for group, values in zip(_GROUPS.values(), common, strict=True):
             good[:, group] &= ~among(used[:, group], values)
-        high = ((used[:, GEOMETRY:] & _MAGNITUDE) >> np.uint32(DEEPEST + 1)).astype(np.int32)
-        colours = high.reshape(len(used), -1, 3)
-        near = np.abs(colours - colours[:, :, [1, 2, 0]]) <= 1
+        high = ((used & _MAGNITUDE) >> np.uint32(DEEPEST + 1)).astype(np.int32)
+        triples = np.delete(high, slice(3, GEOMETRY), axis=1).reshape(len(used), -1, 3)
+        near = np.abs(triples - triples[:, :, [1, 2, 0]]) <= 1
         fine[start:stop] = good[:, layout.columns].all(axis=1) & ~near.any(axis=(1, 2))
         fine[start:stop] &= (used[:, layout.columns] & LOW == 0).sum(axis=1) < _SHORT
         if layout.quats:
