@@ -59,7 +59,8 @@ def _keyss(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.delenv("KEYSS_DEBUG", raising=False)
     monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.setattr("sys.stdin", io.StringIO())
-    monkeypatch.setattr("keyss.progress._QUIET_SECONDS", 1e6)  # slow machines print no further lines
+    for pause in ("_QUIET_SECONDS", "_WAIT_SECONDS"):  # slow machines print no further lines
+        monkeypatch.setattr(f"keyss.progress.{pause}", 1e6)
 
     def run(*arguments: object) -> Result:
         capsys.readouterr()

@@ -106,6 +106,7 @@ def test_time_left_follows_the_pace_of_the_work(timer: Timer) -> None:
 
 def test_long_waits_are_logged(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("keyss.progress._QUIET_SECONDS", 0.05)
+    monkeypatch.setattr("keyss.progress._WAIT_SECONDS", 10.0)
     monkeypatch.setattr("keyss.progress._crowding", lambda: 1.0)
     log = console(False)
     with ProgressLines(log).waiting("checking a.ply", 100):
@@ -123,8 +124,16 @@ def test_long_waits_are_logged(monkeypatch: pytest.MonkeyPatch) -> None:
     assert text(log) == before
 
 
-def test_waits_are_displayed_in_terminals() -> None:
+def test_only_long_waits_are_displayed_in_terminals(monkeypatch: pytest.MonkeyPatch) -> None:
     screen = console(True)
+    with ProgressLines(screen).waiting("nothing to do", 100):
+        pass
+    assert text(screen) == ""
+    monkeypatch.setattr("keyss.progress._DELAY_SECONDS", 0.01)
     with ProgressLines(screen).waiting("checking a.ply", 100) as share:
         share(0.5)
-    assert "checking a.ply: 0:00" in text(screen)
+        for _ in range(500):
+            time.sleep(0.02)
+            if text(screen):
+                break
+    assert "checking a.ply: 0:0" in text(screen)

@@ -14,6 +14,7 @@ from rich.table import Column
 from rich.text import Text
 
 level = 0  # -1: silent, 1: more often; set by the command line
+_DELAY_SECONDS = 1.0  # before a terminal displays a wait
 # In logs: before the first line of a long wait; between lines, and before the first line of a short wait.
 _QUIET_SECONDS, _WAIT_SECONDS = 2.0, 10.0
 _PRIOR = 0.1  # weight of an estimated time in the pace of a wait, relative to all of its work
@@ -119,30 +120,31 @@ class ProgressLines(Reporter):
 
     @contextmanager
     def waiting(self, what: str, seconds: float) -> Iterator[Share]:
-        """See `Reporter`. A terminal displays a moving sign; logs get a line every 10 s.
+        """See `Reporter`. A terminal displays a moving sign after 1 s; logs get a line every 10 s.
 
         The first line of a long wait is logged after 2 s.
         """
         wait = Wait(what, seconds * _crowding(), self.timer)
-        if self.live:
-            with self.console.status(wait, refresh_per_second=4):
-                yield wait.update
-            return
         ended = threading.Event()
 
-        def log() -> None:
+        def display() -> None:
+            if self.live:
+                if not ended.wait(_DELAY_SECONDS):
+                    with self.console.status(wait, refresh_per_second=4):
+                        ended.wait()
+                return
             pause = _QUIET_SECONDS if wait.seconds > _WAIT_SECONDS else _WAIT_SECONDS
             while not ended.wait(pause):
                 self.note(str(wait))
                 pause = max(_WAIT_SECONDS, self.every)
 
-        lines = threading.Thread(target=log, daemon=True)
-        lines.start()
+        displayed = threading.Thread(target=display, daemon=True)
+        displayed.start()
         try:
             yield wait.update
         finally:
             ended.set()
-            lines.join()
+            displayed.join()
 
 
 class Wait:

@@ -117,9 +117,9 @@ def test_rotate_phone_with_secret(chromium: Any, page_file: Path, secret: Gaussi
         tab.at(POSE)
         size = assert_drawn(tab, secret)
         tab.page.tap("#keying > summary")
-        folded = assert_drawn(tab, secret)
-        assert folded[1] > size[1]
-        for viewport, size in ((LANDSCAPE, (844 - PANEL, 390)), (PORTRAIT, folded)):
+        unfolded = assert_drawn(tab, secret)
+        assert unfolded[1] < size[1]
+        for viewport, size in ((LANDSCAPE, (844 - PANEL, 390)), (PORTRAIT, unfolded)):
             tab.page.set_viewport_size(viewport)
             assert assert_drawn(tab, secret) == size
             assert tab.page.input_value("#wipe") == "100"

@@ -1,6 +1,7 @@
 /** Codewords made with slow arithmetic, with losses and errors. */
 import { expect, test } from 'vitest';
-import { decoded } from '../src/channels/reed_solomon.ts';
+import { decoded, type Shards } from '../src/channels/reed_solomon.ts';
+import { joined } from '../src/core/bytes.ts';
 import { random } from './vectors.ts';
 
 function product(a: number, b: number): number {
@@ -27,6 +28,10 @@ function shardsOf(n: number, k: number, draw: () => number): Uint8Array[] {
   });
 }
 
+const together = (shards: [number, Uint8Array][]): Shards => ({
+  numbers: shards.map(([number]) => number), data: joined(...shards.map(([, shard]) => shard)),
+});
+
 test.each([[1, 9, 3, 2], [12, 40, 9, 10], [100, 180, 20, 40], [30, 30, 0, 0]])(
   '%i of %i shards, %i wrong and %i lost',
   (k, n, wrong, lost) => {
@@ -38,9 +43,9 @@ test.each([[1, 9, 3, 2], [12, 40, 9, 10], [100, 180, 20, 40], [30, 30, 0, 0]])(
     const seen = numbered.map(([number, shard], at): [number, Uint8Array] => [
       number, at < wrong ? shard.map((each) => each ^ 77) : shard,
     ]);
-    const data = decoded({ count: 2, n, k, width: 4 }, seen.reverse(), wrong > 0);
+    const data = decoded({ count: 2, n, k, width: 4 }, together(seen.reverse()), wrong > 0);
     const expected = Array.from({ length: k }, (_, row) => two.map((shards) => [...shards[row]])).flat(2);
     expect([...data]).toEqual(expected);
-    if (lost) expect(() => decoded({ count: 2, n, k, width: 4 }, seen.slice(0, 2 * k - 1))).toThrow(/^The key is right/);
+    if (lost) expect(() => decoded({ count: 2, n, k, width: 4 }, together(seen.slice(0, 2 * k - 1)))).toThrow(/^The key is right/);
   },
 );

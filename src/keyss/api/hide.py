@@ -143,26 +143,28 @@ def hide(
             sources = fit_plain_models(sources, prepared.fits, context)
             prepared = chosen.prepare(sources, options, prepared)
         context = replace(context, entropy=_entropy(given.keys, prepared.options, sources))
-        stego = chosen.hide(sources, prepared, context)
         plain = list(map(PlainModel.of, sources, prepared.training, plain_steps))
         results: dict[str, Any] = {**given.models_to_write(sources)}
-        published = with_extras(
-            stego.gaussians, cover if cover_model is None else cover_model, sources[0].model
-        )
         # Test renders replace given models, which frees memory for the revealed ones.
-        prepared = replace(prepared, capacity=None)
+        handed, plain_cover = sources, sources[0].model
         sources = [source if source.photos else replace(source, given=None) for source in sources]
+        stego = chosen.hide(handed, prepared, context)
+        prepared = replace(prepared, capacity=None)
+        published = with_extras(stego.gaussians, cover if cover_model is None else cover_model, plain_cover)
+        del plain_cover
         with reporter.waiting("reading the published file, and comparing renders", cost.check_seconds):
             models = _write_and_read(stego, published, given.keys, folder)
             shown = list(map(partial(compare_with, target), sources, models))
         check_quality(shown, min_psnr, models, plain, prepared, resumes=trains)
         longer = _fit_bounds(plain, sources, models, prepared, context) if bound else {}
-        metrics = hide_metrics(stego, models, sources, shown, plain, longer, prepared, target)
-        metrics = replace(metrics, seconds=round(time.monotonic() - began, 1))
-        if folder:
-            results |= {bound_names(len(secrets))[index]: model for index, model in longer.items()}
-            settings = replace(settings, payloads=secret_ids(metrics.seed, stego.opened))
-            folder.write(results | {CONFIG: settings, METRICS: metrics, LOOK: _look(models, sources, target)})
+        with reporter.waiting("measuring, and writing private files", cost.view_seconds):
+            metrics = hide_metrics(stego, models, sources, shown, plain, longer, prepared, target)
+            metrics = replace(metrics, seconds=round(time.monotonic() - began, 1))
+            if folder:
+                results |= {bound_names(len(secrets))[index]: model for index, model in longer.items()}
+                settings = replace(settings, payloads=secret_ids(metrics.seed, stego.opened))
+                look = _look(models, sources, target)
+                folder.write(results | {CONFIG: settings, METRICS: metrics, LOOK: look})
     return HideResult(stego.gaussians, metrics, survives=prepared.survives)
 
 

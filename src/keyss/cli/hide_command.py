@@ -279,6 +279,7 @@ def _kind_of_device(args: HideArguments) -> str:
     """The device of the preset; where nothing is trained, without importing torch."""
     if args.device != "auto" or not args.secret:
         return "cuda" if args.device == "cuda" else "cpu"
+    verb("hide")  # imports torch
     from keyss.rendering import resolve_device
 
     return resolve_device(args.device).type

@@ -165,7 +165,7 @@ def info(
     from keyss.runs.describe import info as describe
     from keyss.runs.estimates import seconds_for
 
-    with waiting(f"reading {path.name}", seconds_for("info", path)):
+    with waiting(f"reading {path.name}", seconds_for("info --capacity" if capacity else "info", path)):
         described = describe(path, capacity=capacity)
     (print_json if json_ else print_info)(described)
 

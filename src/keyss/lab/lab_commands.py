@@ -68,8 +68,11 @@ def audit(
 
     if dry_run:
         from keyss.lab.audits.audit_run import forecast_audit
+        from keyss.runs.estimates import seconds_for
+        from keyss.runs.files import stego_in
 
-        seconds = forecast_audit(run, controls=controls, only=only, device=device)
+        with progress.waiting("reading the scenes", seconds_for("prepare", stego_in(run))):
+            seconds = forecast_audit(run, controls=controls, only=only, device=device)
         print_table(
             ("part", "time, about"), [(name, progress.about(duration)) for name, duration in seconds.items()]
         )

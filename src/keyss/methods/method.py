@@ -256,10 +256,11 @@ class Method(Protocol):
         stay. Raises UsageError and InputError for what cannot work.
         """
 
-    def hide(self, sources: Sequence[Source], prepared: Prepared, context: Context) -> Stego:
+    def hide(self, sources: list[Source], prepared: Prepared, context: Context) -> Stego:
         """Hide the secrets; all plain models are fitted, and the options have a seed.
 
-        Raises KeyssError and its children, Interrupted.
+        May empty `sources`, which frees the memory of models early. Raises KeyssError and its children,
+        Interrupted.
         """
 
 

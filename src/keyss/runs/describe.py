@@ -161,13 +161,19 @@ def _model_info(path: Path, capacity: bool = False) -> ModelInfo:
     return ModelInfo(
         kind="3DGS model",
         path=str(path),
-        bytes=None if is_standard(path) else path.stat().st_size,
+        bytes=None if is_standard(path) else _size_of(path),
         gaussians=count,
         sh_degree=degree,
         bounding_box=(low, high),
         nearly_transparent=round(transparent / count, 4),
         capacity=capacities,
     )
+
+
+def _size_of(path: Path) -> int:
+    """Bytes of a model's file; of an unpacked SOG with its pictures."""
+    pictures = path.parent.glob("*.webp") if is_unpacked_sog(path) else ()
+    return sum(file.stat().st_size for file in (path, *pictures))
 
 
 def _read_model(path: Path) -> Gaussians:

@@ -22,11 +22,11 @@ from keyss.methods.plain_models import Bound
 from keyss.progress import about
 
 _STEP_SECONDS = {"cpu": 5e-7, "cuda": 6e-9}  # per training step, Gaussian and two pixels
-_READ_SECONDS = 3e-6  # per Gaussian: writing a model, and reading it again
-_RENDERS = 2  # training steps that take as long as measuring a test view
+_VIEW_SECONDS = {"cpu": (1e-7, 8e-7), "cuda": (1e-8, 1e-8)}  # to measure a view, per Gaussian and pixel
+_READ_SECONDS = 1.5e-6  # per Gaussian: writing a model, and reading it again
 _CHECKPOINTS = 6  # two checkpoints / model: each holds parameters and two moments of Adam
 _MAX_APPENDED = 7  # Gaussians that hold one Gaussian of a secret of SH degree 3
-_COPIES = 2  # of what is published and of the secrets in memory, beside the given models
+_COPIES = 1  # of what is published and of the secrets in memory, beside the given models
 _SHARDS = 7  # copies of appended Gaussians: their shards, coded, placed and read again
 _OTHER_BYTES = 4 << 20  # JSON files, locks, and the overhead of the file system
 
@@ -106,7 +106,8 @@ def cost_of(
 
 def view_seconds(device: str, gaussians: int, scene: Scene) -> float:
     """About the seconds to measure a model, and its plain model, on one test view of a scene."""
-    return _RENDERS * step_seconds(device, gaussians, _pixels(scene))
+    per_gaussian, per_pixel = _VIEW_SECONDS[device]
+    return per_gaussian * gaussians + per_pixel * _pixels(scene)
 
 
 def step_seconds(device: str, gaussians: int, pixels: int) -> float:

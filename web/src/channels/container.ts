@@ -5,7 +5,7 @@
 import { ascii, bytesKey, joined, viewOf } from '../core/bytes.ts';
 import { damaged, InputError, otherVersion } from '../core/errors.ts';
 import { decrypted, type Derive, expand, streamWords } from '../keys/keys.ts';
-import { type Codewords, decoded } from './reed_solomon.ts';
+import { type Codewords, decoded, type Shards } from './reed_solomon.ts';
 
 /** Bytes that are read completely or not at all. */
 export interface Payload {
@@ -46,7 +46,7 @@ export async function unsealed(dataKey: Uint8Array, sealed: Uint8Array, recordBy
 
 /** `unsealed` from numbered shards; looks for false ones only if authentication fails. */
 export async function unsealedShards(
-  dataKey: Uint8Array, codewords: Codewords, shards: readonly [number, Uint8Array][], recordBytes: number,
+  dataKey: Uint8Array, codewords: Codewords, shards: Shards, recordBytes: number,
 ): Promise<[Uint8Array, Payload]> {
   try {
     return await unsealed(dataKey, decoded(codewords, shards, false), recordBytes);

@@ -42,47 +42,58 @@ export interface Codewords {
   readonly width: number;
 }
 
-/** Shards [n], null if lost, of one codeword. */
-type Shards = (Uint8Array | null)[];
+/** Shards in any order. */
+export interface Shards {
+  readonly numbers: ArrayLike<number>; // [C]
+  readonly data: Uint8Array; // [C, width]
+}
 
-/**
- * The data from numbered shards in any order. `errors`: some shards may be wrong. Raises InputError for too few shards.
- */
-export function decoded(
-  { count, n, k, width }: Codewords, shards: Iterable<readonly [number, Uint8Array]>, errors = false,
-): Uint8Array {
-  const left = new Map<number, Uint8Array | null>(); // null: different shards claim this number
-  for (const [number, shard] of shards) {
-    const other = left.get(number);
-    const alike = other === undefined || (other?.every((each, at) => each === shard[at]) ?? false);
-    if (number < count * n) left.set(number, alike ? shard : null);
+/** Shards [n], null if lost, of one codeword. */
+type OwnShards = (Uint8Array | null)[];
+
+const [LOST, CONTRADICTORY] = [-1, -2];
+
+/** The data. `errors`: some shards may be wrong. Raises InputError for too few shards. */
+export function decoded({ count, n, k, width }: Codewords, { numbers, data: shards }: Shards, errors = false): Uint8Array {
+  if (numbers.length < count * k) throw tooMuchLost(); // before allocating
+  const rows = new Int32Array(n * count).fill(LOST);
+  for (let row = 0; row < numbers.length; row++) {
+    const [number, other] = [numbers[row], rows[numbers[row]]];
+    if (other === LOST) rows[number] = row;
+    else if (other >= 0 && !isEqual(shards, other * width, row * width, width)) rows[number] = CONTRADICTORY;
   }
-  if (left.size < count * k) throw tooMuchLost(); // before allocating
   const data = new Uint8Array(count * k * width);
-  const incomplete: { shards: Shards; codeword: number }[] = [];
+  const incomplete: { own: OwnShards; codeword: number }[] = [];
   for (let codeword = 0; codeword < count; codeword++) {
-    const own: Shards = Array.from({ length: n }, (_, row) => left.get(row * count + codeword) ?? null);
+    const own = Array.from({ length: n }, (_, each) => rows[each * count + codeword]).map((row) =>
+      row < 0 ? null : shards.subarray(row * width, (row + 1) * width),
+    );
     if (errors) dropErrors(own, k);
     if (own.reduce((sum, each) => sum + (each ? 1 : 0), 0) < k) throw tooMuchLost();
     for (let row = 0; row < k; row++) {
       const shard = own[row];
       if (shard) data.set(shard, (row * count + codeword) * width);
     }
-    if (own.indexOf(null) >= 0 && own.indexOf(null) < k) incomplete.push({ shards: own, codeword });
+    if (own.indexOf(null) >= 0 && own.indexOf(null) < k) incomplete.push({ own, codeword });
   }
   const atOnce = Math.max(1, Math.floor((2 * COLUMNS) / width));
   for (let first = 0; first < incomplete.length; first += atOnce) {
     const some = incomplete.slice(first, first + atOnce);
-    restore(some.map((each) => each.shards), k, width / 2, (own, row, shard) => {
-      data.set(shard, (row * count + some[own].codeword) * width);
+    restore(some.map(({ own }) => own), k, width / 2, (at, row, shard) => {
+      data.set(shard, (row * count + some[at].codeword) * width);
     });
   }
   return data;
 }
 
+function isEqual(bytes: Uint8Array, a: number, b: number, width: number): boolean {
+  for (let at = 0; at < width; at++) if (bytes[a + at] !== bytes[b + at]) return false;
+  return true;
+}
+
 /** Calls `put` with every lost one of the first k shards of some codewords of `columns` symbols. */
 function restore(
-  codewords: Shards[], k: number, columns: number, put: (codeword: number, row: number, shard: Uint8Array) => void,
+  codewords: OwnShards[], k: number, columns: number, put: (codeword: number, row: number, shard: Uint8Array) => void,
 ): void {
   const size = sizeFor(codewords[0].length);
   const width = columns * codewords.length;
@@ -192,7 +203,7 @@ function differentiate(work: Uint16Array, size: number, width: number): void {
 }
 
 /** Sets shards to null that do not belong to the codeword of the majority; all if there are too many errors. */
-function dropErrors(shards: Shards, k: number): void {
+function dropErrors(shards: OwnShards, k: number): void {
   const rows = shards.flatMap((shard, row) => (shard ? [row] : []));
   if (rows.length <= k) return;
   const products = differences(sizeFor(shards.length), (row) => Boolean(shards[row]));

@@ -90,7 +90,7 @@ export class Viewer {
     }
     half.model = model;
     half.splats = half.coarse = null;
-    if (model && model.count > LARGE) this.setScale(COARSE);
+    if (model && (this.slow || model.count > LARGE)) this.setScale(COARSE);
     this.place(half);
     this.layOut();
     this.touch();
@@ -262,7 +262,8 @@ function gsplatData(model: Gaussians): GSplatData {
   const { count } = model;
   const properties = plyColumns(model.shDegree).map(({ name, to, offset }) => {
     const width = model[to].length / count;
-    const storage = new Float32Array(count).map((_, row) => model[to][row * width + offset]);
+    const [values, storage] = [model[to], new Float32Array(count)];
+    for (let row = 0; row < count; row++) storage[row] = values[row * width + offset];
     return { name, type: 'float', storage, byteSize: 4 };
   });
   return new GSplatData([{ name: 'vertex', count, properties }] as never);

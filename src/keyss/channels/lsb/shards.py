@@ -41,13 +41,15 @@ _BLOCK = 16
 def function(secret: bytes, label: str, ids: Bytes, size: int = _BLOCK) -> Bytes:
     """[N, size] a pseudo-random function of `ids` [N, 16]; bytes 16 i to 16 i + 15 are AES of (ID xor i)."""
     key, blocks = expand(secret, f"lsb/{label}", 32), -(-size // _BLOCK)
+    found = np.empty((len(ids), size), np.uint8)
 
-    def work(start: int, stop: int) -> Bytes:
+    def work(start: int, stop: int) -> None:
         counted = np.repeat(ids[start:stop, None], blocks, axis=1)
         counted[:, :, -1] ^= np.arange(blocks, dtype=np.uint8)
-        return encrypted_blocks(key, counted).reshape(stop - start, -1)[:, :size]
+        found[start:stop] = encrypted_blocks(key, counted).reshape(stop - start, -1)[:, :size]
 
-    return np.concatenate([np.empty((0, size), np.uint8), *in_blocks(work, len(ids), _ROWS)])
+    in_blocks(work, len(ids), _ROWS)
+    return found
 
 
 def parameter_pads(data_key: bytes, ids: Bytes) -> Bytes:
@@ -138,7 +140,8 @@ class Shards:
         shard, codeword = np.divmod(numbers, self.codewords.count)
         local = shard * self._of_group + codeword % self._of_group
         masked = (masks ^ local.astype("<u2"))[:, None].view(np.uint8)
-        data = shards ^ function(self.data_key, "shard/pad", ids, self.codewords.width)
+        data = function(self.data_key, "shard/pad", ids, self.codewords.width)
+        data ^= shards
         return np.concatenate([tags[:, None][:, : self.tagged], masked, data], axis=1)
 
     def decrypt(self, ids: Bytes, low: Bytes) -> tuple[Flags, Integers, Bytes]:
@@ -150,8 +153,8 @@ class Shards:
         if self.tagged:
             fits &= low[:, 0] == tags
         start = at + _NUMBER_BYTES
-        data = low[fits, start : start + self.codewords.width]
-        data = data ^ function(self.data_key, "shard/pad", ids[fits], self.codewords.width)
+        data = function(self.data_key, "shard/pad", ids[fits], self.codewords.width)
+        data ^= low[fits, start : start + self.codewords.width]
         return fits, self._number(group[fits], local[fits].astype(np.int64)), data
 
     @property

@@ -20,7 +20,7 @@ _ROUNDS = 50
 _BINS = 1024  # of equal counts, to estimate the density
 _MIN_WIDTH = 1e-6  # bin width relative to the range; values may be equal
 _AXES = 12  # principal axes to split along
-_SAMPLE = 50_000  # vectors for computing the axes
+_SAMPLE = 50_000  # vectors for computing the axes, and at a time
 
 
 def codebook_of(values: Floats) -> Floats:
@@ -62,17 +62,25 @@ def nearest(codebook: Floats, values: Floats) -> Bytes:
 
 def palette_of(vectors: Floats, size: int) -> tuple[Floats, Shorts]:
     """A palette [P, D] of at most `size` (up to 65,536) vectors for `vectors` [N, D], and labels [N]."""
-    with np.errstate(over="ignore"):
-        centred = np.nan_to_num(vectors - vectors.mean(axis=0, dtype=np.float64).astype(np.float32))
-    sample = centred[:: max(1, len(centred) // _SAMPLE)].astype(np.float64)
+    mean = vectors.mean(axis=0, dtype=np.float64).astype(np.float32)
+
+    def centred(some: Floats) -> Doubles:
+        with np.errstate(over="ignore"):
+            found: Doubles = np.nan_to_num(some - mean).astype(np.float64)
+        return found
+
+    sample = centred(vectors[:: max(1, len(vectors) // _SAMPLE)])
     _, axes = np.linalg.eigh(sample.T @ sample)
-    shadow = np.ascontiguousarray(centred.astype(np.float64) @ axes[:, : -_AXES - 1 : -1])
+    largest = axes[:, : -_AXES - 1 : -1]
+    shadow = np.empty((len(vectors), largest.shape[1]))
+    for start in range(0, len(vectors), _SAMPLE):
+        shadow[start : start + _SAMPLE] = centred(vectors[start : start + _SAMPLE]) @ largest
     order, starts = groups(shadow, size)
     count = np.diff(np.append(starts, len(vectors)))
-    palette = np.add.reduceat(vectors[order], starts, axis=0, dtype=np.float64) / count[:, None]
     labels = np.empty(len(vectors), np.uint16)
     labels[order] = np.repeat(np.arange(len(starts)), count)
-    return palette.astype(np.float32), labels
+    sums = [np.bincount(labels, column, len(starts)) for column in vectors.T]
+    return (np.stack(sums, axis=1) / count[:, None]).astype(np.float32), labels
 
 
 def groups(points: Doubles, size: int) -> tuple[Integers, Integers]:

@@ -109,20 +109,22 @@ class CarryMethod:
             capacity=capacity,
         )
 
-    def hide(self, sources: Sequence[Source], prepared: Prepared, context: Context) -> Stego:
+    def hide(self, sources: list[Source], prepared: Prepared, context: Context) -> Stego:
         """Fine-tune the secrets that need it, embed all, and open each again to check.
 
-        Raises UsageError for a cover without capacity, Interrupted on Ctrl-C, and InputError for a
-        checkpoint of another run.
+        Empties `sources`. Raises UsageError for a cover without capacity, Interrupted on Ctrl-C, and
+        InputError for a checkpoint of another run.
         """
         cover, *secrets = sources
+        sources.clear()
         capacity: CarryCapacity = prepared.capacity
         assert capacity.prepared is not None  # the cover is fitted
-        plain = [secret.model for secret in secrets]
+        keys = [secret.key for secret in secrets]
         viewpoints = [Viewpoints.of(secret.scene) for secret in secrets]
-        models = list(plain)
+        models = [secret.model for secret in secrets]
+        before = [*map(len, models)]
         if prepared.trains:
-            fitting = capacity.prune(plain, viewpoints)
+            fitting = capacity.prune(models, viewpoints)
             for index, secret in enumerate(secrets):
                 if steps := prepared.training[index + 1].steps:
                     kept = fitting[index]
@@ -130,23 +132,22 @@ class CarryMethod:
                         secret.model.with_sh_degree(kept.sh_degree),
                         secret.scene,
                         max(1, int(_FINE_TUNED_SHARE * len(kept)))
-                        if len(kept) < len(plain[index])
+                        if len(kept) < before[index]
                         else len(kept),
                         replace(prepared.options.fit, iterations=steps),
                         context,
                         photos=secret.photos,
-                        name=role_of(index + 1, len(sources)),
+                        name=role_of(index + 1, len(before) + 1),
                     )
+            del fitting
+        del secrets
         seconds = seconds_to_hide(len(cover.model), [*map(len, models)], prepared.grows)
         with context.waiting("hiding", seconds):
+            models = capacity.prune(models, viewpoints)
             stego = embed_models(
-                capacity.prepared,
-                [secret.key for secret in secrets],
-                capacity.prune(models, viewpoints),
-                viewpoints=viewpoints,
-                entropy=context.entropy,
+                capacity.prepared, keys, models, viewpoints=viewpoints, entropy=context.entropy
             )
-        details = {"gaussians_before_pruning": [len(model) for model in plain], **stego.details}
+        details = {"gaussians_before_pruning": before, **stego.details}
         return replace(stego, iterations=max(trained.steps for trained in prepared.training), details=details)
 
 
@@ -215,12 +216,12 @@ def most_contributing(plain: Gaussians, scene: Scene, count: int) -> Gaussians:
 def embed_models(
     cover: PreparedCover,
     keys: Sequence[str],
-    models: Sequence[Gaussians],
+    models: list[Gaussians],
     *,
     viewpoints: Sequence[Viewpoints] | None = None,
     entropy: bytes | None = None,
 ) -> Stego:
-    """Embed each model under its key, and verify that it opens.
+    """Embed each model under its key, and verify that it opens. Empties `models`, which may free memory.
 
     `viewpoints`: views of each model that determine its precision; by default, four around it. Raises
     UsageError if the models do not fit. Warns (KeyssWarning) if a secret gets fewer bytes than alone.
@@ -228,10 +229,12 @@ def embed_models(
     viewpoints, capacity = viewpoints or [*map(Viewpoints.around, models)], cover.capacity
     needed = list(map(finest_size, models))
     capacity.warn_of_sharing(needed)
-    limits = capacity.limits(needed)
+    counts, degrees = [*map(len, models)], [model.sh_degree for model in models]
     payloads = [
-        Payload(CarryOptions.method, encode_to_size(model, limit, short=capacity.grows, viewpoints=views))
-        for model, limit, views in zip(models, limits, viewpoints, strict=True)
+        Payload(
+            CarryOptions.method, encode_to_size(models.pop(0), limit, short=capacity.grows, viewpoints=views)
+        )
+        for limit, views in zip(capacity.limits(needed), viewpoints, strict=True)
     ]
     stego = cover.embed(list(zip(keys, payloads, strict=True)), entropy=entropy)
     opened = [CarriedSecret(open_payload(stego, key)) for key in keys]
@@ -240,10 +243,8 @@ def embed_models(
     sizes = [len(payload.data) for payload in payloads]
     details: dict[str, Any] = {
         "secret_bytes": sizes,
-        "sh_degrees": [model.sh_degree for model in models],
-        "bits_per_gaussian": [
-            round(8 * size / len(model)) for size, model in zip(sizes, models, strict=True)
-        ],
+        "sh_degrees": degrees,
+        "bits_per_gaussian": [round(8 * size / count) for size, count in zip(sizes, counts, strict=True)],
     }
     if not capacity.grows:
         details["capacity_bytes"] = capacity.bytes

@@ -10,7 +10,7 @@ import { encryptBlocks } from '../../keys/aes.ts';
 import { type Derive, expand, here } from '../../keys/keys.ts';
 import { keySecret, type Payload, type Reader, unsealedShards } from '../container.ts';
 import { COARSE_BYTES, coarseForeign } from '../foreign.ts';
-import type { Codewords } from '../reed_solomon.ts';
+import type { Codewords, Shards } from '../reed_solomon.ts';
 import { type Found, LEAST, ONE_IN, pilotsOf, POSITION_BITS, readPilots } from './pilots.ts';
 
 // Gaussians sampled for pilots; number of lattice offsets tried, with at least this many standard deviations more pilots
@@ -105,29 +105,35 @@ function wordsOfPoints(colours: Uint8Array, scales: Uint8Array, others: Uint16Ar
   return bytes;
 }
 
-/** [number, data] of each word, data bytes and then a tag, as if all were packets. */
-function readPackets(key: Uint8Array, bytes: Uint8Array, width: number): [number, Uint8Array][] {
-  const [count, found] = [bytes.length / WORD_BYTES, [] as [number, Uint8Array][]];
-  const blocks = new Uint8Array(16 * count);
-  for (let row = 0; row < count; row++) blocks.set(bytes.subarray(WORD_BYTES * row, WORD_BYTES * row + width), 16 * row);
+/** All words as if they were packets: data bytes, and then a tag, the encrypted number. */
+function readPackets(key: Uint8Array, bytes: Uint8Array, width: number): Shards {
+  const count = bytes.length / WORD_BYTES;
+  const [numbers, data, blocks] = [new Float64Array(count), new Uint8Array(width * count), new Uint8Array(16 * count)];
+  for (let row = 0; row < count; row++) {
+    for (let byte = 0; byte < width; byte++) {
+      data[width * row + byte] = blocks[16 * row + byte] = bytes[WORD_BYTES * row + byte];
+    }
+  }
   const encrypted = encryptBlocks(key, blocks);
   for (let row = 0; row < count; row++) {
     let tag = 0;
     for (let byte = 0; byte < WORD_BYTES - width; byte++) {
       tag = 256 * tag + (bytes[WORD_BYTES * row + width + byte] ^ encrypted[16 * row + byte]); // may pass 2^32
     }
-    found.push([Math.floor(tag / 16), blocks.subarray(16 * row, 16 * row + width)]);
+    numbers[row] = Math.floor(tag / 16);
   }
-  return found;
+  return { numbers, data };
 }
 
 /** The codewords by majority of the headers; null if too few agree. Copies of one word have one vote. */
 function readHeader(key: Uint8Array, words: Uint8Array, width: number): Codewords | null {
   const votes = new Uint32Array(1 << HEADER_BITS);
   const seen = new Set<number>();
-  for (const [number, data] of readPackets(key, words, width)) {
-    const first = viewOf(data).getUint32(0) * 2 ** 16 + viewOf(data).getUint16(4);
-    if (number < votes.length && !seen.has(first)) votes[number]++;
+  const { numbers, data } = readPackets(key, words, width);
+  const view = viewOf(data);
+  for (let row = 0; row < numbers.length; row++) {
+    const first = view.getUint32(width * row) * 2 ** 16 + view.getUint16(width * row + 4);
+    if (numbers[row] < votes.length && !seen.has(first)) votes[numbers[row]]++;
     seen.add(first);
   }
   const header = votes.reduce((best, each, value) => (each > votes[best] ? value : best), 0);

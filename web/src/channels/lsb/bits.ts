@@ -79,22 +79,31 @@ export function gaussianIds(gaussians: Gaussians, fields: Fields): Uint8Array {
   return found;
 }
 
-/** Whole bytes in the low bits of one Gaussian. */
-export function lowWidth(fields: Fields, depth: number): number {
-  return Math.floor((fields.inUse.length * depth) / 8);
+/** [N, F] the low bits at the greatest depth: a byte for each field in use. */
+export function lowBits({ count, width, words, inUse }: Fields): Uint8Array {
+  const found = new Uint8Array(count * inUse.length);
+  for (let row = 0, to = 0; row < count; row++) {
+    for (let field = 0; field < inUse.length; field++) found[to++] = words[row * width + inUse[field]] >>> 1;
+  }
+  return found;
 }
 
-/** [N, B] the low bits as bytes, field after field, the highest bit first. */
-export function lowBits(fields: Fields, depth: number): Uint8Array {
-  const { count, width, words, inUse } = fields;
+/** Whole bytes in the low bits of one Gaussian with `fields` in use. */
+export function lowWidth(fields: number, depth: number): number {
+  return Math.floor((fields * depth) / 8);
+}
+
+/** [N, B] the low bits [N, fields] at a depth, field after field, the highest bit first. */
+export function atDepth(low: Uint8Array, fields: number, depth: number): Uint8Array {
+  if (depth === DEEPEST) return low;
   const size = lowWidth(fields, depth);
-  const found = new Uint8Array(count * size);
+  const found = new Uint8Array((low.length / fields) * size);
   const mask = (1 << depth) - 1;
-  for (let row = 0, to = 0; row < count; row++) {
+  for (let from = 0, end = 0, to = 0; from < low.length; ) {
     let [bits, held] = [0, 0];
-    const end = (row + 1) * size;
-    for (const field of inUse) {
-      bits = (bits << depth) | ((words[row * width + field] >>> 1) & mask);
+    end += size;
+    for (let field = 0; field < fields; field++) {
+      bits = (bits << depth) | (low[from++] & mask);
       held += depth;
       if (held >= 8 && to < end) found[to++] = bits >>> (held -= 8);
       bits &= (1 << held) - 1;

@@ -15,8 +15,8 @@ import {
   checkOf, keySecret, PARAMETER_BYTES, type Parameters, type Payload, type Reader, unpackedParameters, unsealed, unsealedShards,
 } from '../container.ts';
 import { EXACT_BYTES, exactForeign } from '../foreign.ts';
-import type { Codewords } from '../reed_solomon.ts';
-import { DEEPEST, DEPTHS, fieldsOf, gaussianIds, ID_BYTES, LEAST, lowBits, lowWidth, saltOf, salts } from './bits.ts';
+import type { Codewords, Shards } from '../reed_solomon.ts';
+import { atDepth, DEEPEST, DEPTHS, fieldsOf, gaussianIds, ID_BYTES, LEAST, lowBits, lowWidth, saltOf, salts } from './bits.ts';
 import { BLOCK_BYTES, lastBits, type Levels, levelsOf, modelHash, readBlocks } from './fields.ts';
 import { isTagged, isWhole, message, parameterPads, shardBytes, shardsOf, type Table } from './shards.ts';
 
@@ -59,7 +59,8 @@ export abstract class LsbReader implements Reader {
 class LowBitsReader extends LsbReader {
   private constructor(
     salts: readonly Uint8Array[],
-    private readonly fields: ReturnType<typeof fieldsOf>,
+    private readonly fields: number, // in use
+    private readonly low: Uint8Array, // [N, fields] at the greatest depth
     private readonly table: Table, // at the least depth
   ) {
     super(salts);
@@ -67,13 +68,15 @@ class LowBitsReader extends LsbReader {
 
   static ofModel(model: Gaussians): LowBitsReader {
     let fields = fieldsOf(model);
-    let [ids, low, width] = [gaussianIds(model, fields), lowBits(fields, LEAST), lowWidth(fields, LEAST)];
-    const rows = uniqueRows(ids, lowBits(fields, DEEPEST), lowWidth(fields, DEEPEST));
+    let [ids, low] = [gaussianIds(model, fields), lowBits(fields)];
+    const rows = uniqueRows(ids, low, fields.inUse.length);
     if (rows.length < model.count) {
       fields = fieldsOf(selected(model, rows));
-      [ids, low] = [rowsOf(ids, rows, ID_BYTES), rowsOf(low, rows, width)];
+      [ids, low] = [rowsOf(ids, rows, ID_BYTES), lowBits(fields)];
     }
-    return new LowBitsReader(salts(fields, ids, low, width), fields, { ids, low, width });
+    const used = fields.inUse.length;
+    const table = { ids, low: atDepth(low, used, LEAST), width: lowWidth(used, LEAST) };
+    return new LowBitsReader(salts(fields, ids, table.low, table.width), used, low, table);
   }
 
   protected async extract(master: Uint8Array): Promise<Payload | null> {
@@ -102,9 +105,10 @@ class LowBitsReader extends LsbReader {
   }
 
   /** All shards that seem to be there. */
-  private shards(dataKey: Uint8Array, codewords: Codewords, depth: number): [number, Uint8Array][] {
-    const [low, width] = [lowBits(this.fields, depth), lowWidth(this.fields, depth)];
-    return shardsOf(dataKey, codewords, isTagged(width), { ids: this.table.ids, low, width });
+  private shards(dataKey: Uint8Array, codewords: Codewords, depth: number): Shards {
+    const width = lowWidth(this.fields, depth);
+    const table = { ids: this.table.ids, low: atDepth(this.low, this.fields, depth), width };
+    return shardsOf(dataKey, codewords, isTagged(width), table);
   }
 }
 

@@ -6,7 +6,7 @@ import { bytesKey, mostFrequent, rowsOf, viewOf } from '../../core/bytes.ts';
 import { encryptBlocks } from '../../keys/aes.ts';
 import { expand } from '../../keys/keys.ts';
 import { PARAMETER_BYTES } from '../container.ts';
-import type { Codewords } from '../reed_solomon.ts';
+import type { Codewords, Shards } from '../reed_solomon.ts';
 
 const ID_BYTES = 16;
 const BLOCK = 16; // bytes of a block of AES
@@ -18,12 +18,15 @@ const PER_GROUP = 32; // codewords of a group whose rows have tags
 /** [N, size] a pseudo-random function of `ids` [N, 16]. */
 function functionOf(secret: Uint8Array, label: string, ids: Uint8Array, size = BLOCK): Uint8Array {
   const [key, count, blocks] = [expand(secret, `lsb/${label}`), ids.length / ID_BYTES, Math.ceil(size / BLOCK)];
+  if (size === BLOCK) return encryptBlocks(key, ids);
   const found = new Uint8Array(count * size);
   for (let block = 0; block < blocks; block++) {
     const counted = ids.slice();
-    for (let row = 0; row < count; row++) counted[(row + 1) * BLOCK - 1] ^= block;
-    const [values, end] = [encryptBlocks(key, counted), Math.min(BLOCK, size - block * BLOCK)];
-    for (let row = 0; row < count; row++) found.set(values.subarray(row * BLOCK, row * BLOCK + end), row * size + block * BLOCK);
+    for (let last = BLOCK - 1; last < counted.length; last += BLOCK) counted[last] ^= block;
+    const [values, first, end] = [encryptBlocks(key, counted), block * BLOCK, Math.min(BLOCK, size - block * BLOCK)];
+    for (let row = 0; row < count; row++) {
+      for (let byte = 0; byte < end; byte++) found[row * size + first + byte] = values[row * BLOCK + byte];
+    }
   }
   return found;
 }
@@ -61,13 +64,15 @@ export function message(
 /** The rows that are looked at for each fragment: those with the smallest function `values` [N, 16]. */
 function candidatesOf(values: Uint8Array, fragments: number, copies: number): number[][] {
   const [view, count] = [viewOf(values), values.length / BLOCK];
-  const order = Float64Array.from({ length: count }, (_, row) => view.getUint32(row * BLOCK));
   const among = Math.min(count, CANDIDATES * copies * fragments);
-  const bound = among < count ? order.slice().sort()[among - 1] : Infinity;
-  const near: number[] = [];
-  for (let row = 0; row < count; row++) if (order[row] <= bound) near.push(row);
-  const lower = (row: number): number => view.getUint32(row * BLOCK + 4);
-  near.sort((a, b) => order[a] - order[b] || lower(a) - lower(b));
+  let near: number[] = [];
+  // Values are uniform: twice as many as needed, or more, are below this share of the largest.
+  for (let share = (2 * among) / count; near.length < among; share *= 2) {
+    near = [];
+    for (let row = 0; row < count; row++) if (view.getUint32(row * BLOCK) < share * 2 ** 32) near.push(row);
+  }
+  const [upper, lower] = [0, 4].map((at) => (row: number): number => view.getUint32(row * BLOCK + at));
+  near.sort((a, b) => upper(a) - upper(b) || lower(a) - lower(b));
   const candidates = Array.from({ length: fragments }, () => [] as number[]);
   for (const row of near.slice(0, among)) {
     candidates[view.getUint32(row * BLOCK + 8, true) % fragments].push(row);
@@ -75,8 +80,8 @@ function candidatesOf(values: Uint8Array, fragments: number, copies: number): nu
   return candidates;
 }
 
-/** The numbers and data of all shards of a payload that are left in `table`, and false ones. */
-export function shardsOf(dataKey: Uint8Array, codewords: Codewords, tagged: boolean, table: Table): [number, Uint8Array][] {
+/** All shards of a payload that are left in `table`, and false ones. */
+export function shardsOf(dataKey: Uint8Array, codewords: Codewords, tagged: boolean, table: Table): Shards {
   const { ids, low, width } = table;
   const values = functionOf(dataKey, 'shard/place', ids);
   const [view, groups] = [viewOf(values), Math.max(1, Math.floor(codewords.count / (tagged ? PER_GROUP : 1)))];
@@ -96,7 +101,7 @@ export function shardsOf(dataKey: Uint8Array, codewords: Codewords, tagged: bool
   rows.forEach((row, at) => {
     for (let byte = 0; byte < size; byte++) data[at * size + byte] ^= low[row * width + start + byte];
   });
-  return numbers.map((number, at) => [number, data.subarray(at * size, (at + 1) * size)]);
+  return { numbers, data };
 }
 
 /** True if rows of `width` bytes have a tag. */
