@@ -49,7 +49,7 @@ def _capacities() -> None:
         for quats in (True, False):
             layout, carriers = Layout(degree, quats), int(TYPICAL_SHARE * 100_000)
             sizes = [
-                LowBitsCapacity(100_000, carriers, layout, (depth,)).payload_capacity(1) for depth in DEPTHS
+                LowBitsCapacity(100_000, carriers, layout, depth).payload_capacity(1) for depth in DEPTHS
             ]
             name = "" if quats else ", unit quaternions"
             print(f"  degree {degree}{name}: " + ", ".join(f"{size / 100_000:.1f}" for size in sizes))

@@ -5,8 +5,8 @@
 
 Trains models of the scenes in DATA with four ratios of the rates of constant colours and other harmonics,
 and keeps them in the folder `-o`, from which an interrupted run resumes. Prints, for each model, the share of
-usable Gaussians by depth, and the mean and the largest z of the detectors `steps`: the model's own low bits
-against new ones of the deepest kind. Detectors with too few candidates are left out.
+usable Gaussians, the depth that it allows, and the mean and the largest z of the detectors `steps`: its own
+low bits against new ones of 8 bits. Detectors with too few candidates are left out.
 """
 
 from __future__ import annotations
@@ -41,9 +41,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     options.out.mkdir(parents=True, exist_ok=True)
-    print(
-        "| model | Gaussians | usable at 4, 6, 8 bits | mean z | largest z |\n| --- | --- | --- | --- | --- |"
-    )
+    print("| model | Gaussians | usable | bits | mean z | largest z |\n| --- | --- | --- | --- | --- | --- |")
     every: list[float] = []
     for path in options.models:
         every += report(path.stem, read_model(path))
@@ -69,15 +67,15 @@ def trained(scene: Path, width: int, count: int, ratio: int) -> Gaussians:
 def report(name: str, model: Gaussians) -> list[float]:
     """Print a row; returns the z of all detectors."""
     try:
-        usable = Carriers.of(model, Layout.of(model)).usable
+        carriers = Carriers.of(model, Layout.of(model))
     except UsageError as refusal:
-        print(f"| {name} | {len(model):,} | refused: {refusal} | | |", flush=True)
+        print(f"| {name} | {len(model):,} | refused: {refusal} | | | |", flush=True)
         return []
     found = [each.value for each in steps(model, BitPatterns.of(model)).values()]
     found = [each for each in found if math.isfinite(each)]
-    shares = ", ".join(f"{mask.mean():.2f}" for mask in usable.values())
     mean, largest = (sum(found) / len(found), max(found)) if found else (math.nan, math.nan)
-    print(f"| {name} | {len(model):,} | {shares} | {mean:+.2f} | {largest:+.1f} |", flush=True)
+    allowed = f"{carriers.usable.mean():.2f} | {carriers.depth}"
+    print(f"| {name} | {len(model):,} | {allowed} | {mean:+.2f} | {largest:+.1f} |", flush=True)
     return found
 
 

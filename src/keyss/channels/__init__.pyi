@@ -39,11 +39,11 @@ from .lsb.quantised import (
     QuantisedCover as QuantisedCover,
     QuantisedReader as QuantisedReader,
 )
+from .lsb.salts import salt_rows as salt_rows
 from .lsb.shards import Message as Message, Shards as Shards
 from .lsb.usable import (
     Carriers as Carriers,
     chance_of_bits as chance_of_bits,
-    salt_rows as salt_rows,
     usable_carriers as usable_carriers,
 )
 from .names import ConvertedChannel as ConvertedChannel, Format as Format, Publish as Publish

@@ -15,14 +15,14 @@ from keyss.channels import LEAST, Layout, LowBitsCapacity, Parameters, Payload, 
 from keyss.channels.container import key_secret
 from keyss.channels.lsb.low_bits import Writer
 from keyss.channels.lsb.low_bits_capacity import codewords_of, key_message, parameter_message
-from keyss.channels.lsb.usable import SALTS
+from keyss.channels.lsb.salts import SALTS
 from keyss.core import KeyssWarning
 
 CARRIERS, LAYOUT = 4000, Layout(3)
 IDS = np.random.default_rng(0).integers(0, 256, (CARRIERS, 16), np.uint8)
 OWN = keys(0)
 HIDINGS = 40
-CAPACITY = LowBitsCapacity(CARRIERS, CARRIERS, LAYOUT, (LEAST,))
+CAPACITY = LowBitsCapacity(CARRIERS, CARRIERS, LAYOUT, LEAST)
 QUARTER = CAPACITY.for_payloads().shares[0][1]  # bytes that fit into a quarter of these carriers
 THIRD = CAPACITY.for_payloads().equal(3)  # bytes that fit into equal shares of three
 

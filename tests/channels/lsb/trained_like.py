@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from keyss.channels.lsb.usable import SALTS
+from keyss.channels.lsb.salts import SALTS
 from keyss.core import Gaussians
 from keyss.keys import DerivedKey
 

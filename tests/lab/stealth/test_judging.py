@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 
+import numpy as np
 import pytest
 
 from channels.lsb.trained_like import keys
 from keyss.core import UsageError
 from keyss.lab import changed_low_bits, judge
+from keyss.lab.stealth.statistic import portion
 from lab.stealth.candidates import candidate_scores, confirmation_p
 from lab.stealth.careless import banded, overwritten, plain, plain_rounded
 from methods.carry.carried import embed_derived
@@ -77,3 +79,11 @@ def test_carried_secrets_are_not_confirmed() -> None:
         for candidate in candidates
     ]
     assert after == pytest.approx(before, abs=1e-2)
+
+
+def test_numbers_that_change_together_count_once() -> None:
+    copied = np.repeat([1, 0], [40, 960])
+    alone, together = portion(copied), portion(59 * copied, 59)
+    assert (together.value, together.error) == pytest.approx((alone.value, alone.error))
+    assert alone.error == pytest.approx((0.04 * 0.96 / 1000) ** 0.5)
+    assert portion(np.zeros(1000), 59).error == pytest.approx(1 / 59_000)

@@ -9,9 +9,8 @@ While two colours of a Gaussian are wrong by the same factor, the harmonics of b
 A Gaussian is left alone if three numbers of a group (the harmonics of a colour, a quaternion, or scales and
 opacity) moved by equal amounts away from zero, from another of its colours or from one of its nearest
 neighbours, up to the precision of the bits that stay. Halves of a large Gaussian may be far apart: they are
-found by sums and differences of three numbers, which equal steps leave alone. No rate of a trainer is
-assumed. By chance two agree in many Gaussians; whether these predict low bits is tested on each model, at
-each depth.
+found by sums and differences of harmonics, which equal steps do not change. No rate of a trainer is assumed.
+By chance two agree in many Gaussians; whether these predict low bits is tested on each model, at each depth.
 """
 
 from __future__ import annotations
@@ -21,30 +20,29 @@ from typing import Any
 import numpy as np
 import torch
 
-from keyss.channels.lsb.bits import LEAST, LOW, Layout, bit_patterns
+from keyss.channels.lsb.bits import DEEPEST, LEAST, LOW, Layout, bit_patterns
 from keyss.core.arrays import Flags, Integers, Words32, doubles
 from keyss.core.gaussians import Gaussians
-from keyss.core.neighbours import Neighbours, nearest_neighbours
+from keyss.core.neighbours import Neighbours
 from keyss.files.formats.common import morton_order
 from keyss.kernels.jit import inline, kernel
 from keyss.kernels.parallel import in_blocks
 
-_NEIGHBOURS = 12  # siblings were among the nearest 10 in models of 20,000 to 200,000 Gaussians
+_NEIGHBOURS = 8  # most siblings; detectors that look at 12 find no more than with 12 here
 _EQUAL = 3  # numbers
-_ALIKE = 2  # nearest in each of the sums and differences
-_MANY_EQUAL = 5  # harmonics, or all, of Gaussians that were found by three
+_ALIKE, _FURTHER = 2, 1 << 8  # pairs of a Gaussian by sums of three harmonics, and how many are looked at
 _ROWS = 1 << 11  # that a thread takes at a time
 _SAMPLE = 8000  # Gaussians whose pairs of numbers are tested
 _DRAWS = 16
 _PARTS = np.array([[1 / 16], [1 / 8], [1 / 4]])  # of a cell
-_ZERO, _COLOURS = -1, -2  # what a Gaussian is compared with, before its neighbours
-_GEOMETRY, _HARMONICS, _BETWEEN_COLOURS = _KINDS = 0, 1, 2
-_LANES = 16  # of a group: as many as a processor compares at once
+_ZERO, _COLOURS = -1, -2  # what a Gaussian is compared with, instead of another one
+_KINDS = _GEOMETRY, _HARMONICS, _BETWEEN_COLOURS = 0, 1, 2
+_FEW, _LANES = 4, 16  # numbers of a group: geometry, and harmonics; as many as a processor compares at once
 _NAN, _EXPONENT, _MAGNITUDE = np.uint32(0x7FC00000), np.uint32(0x7F800000), np.uint32(0x7FFFFFFF)
 
 
 class Steps:
-    """The numbers of a model, and the nearest neighbours of its Gaussians.
+    """The numbers of a model, and pairs of its Gaussians that may be siblings.
 
     A *cell* is the range of a number's low bits at a depth.
     """
@@ -53,7 +51,6 @@ class Steps:
         means = np.nan_to_num(doubles(gaussians.means), posinf=0, neginf=0)
         self.order = morton_order(means.astype(np.float32))  # what neighbours share stays in the cache
         self.near = np.empty((len(means), min(_NEIGHBOURS, max(0, len(means) - 1))), np.int32)
-        self.words = _words(gaussians, layout)
         if self.near.size:
             tree = Neighbours(means, self.near.shape[1] + 1)
 
@@ -62,22 +59,24 @@ class Steps:
                 self.near[rows] = tree.of(means[rows])[1][:, 1:]
 
             in_blocks(search, len(means), _ROWS)
-        self.alike = _alike(*self.words)
+        self.words = _words(gaussians, layout)
+        self.alike = _alike(self.words[1])
 
     def equal(self, depth: int, among: Flags | None = None) -> Flags:
         """Mask [N] of Gaussians that moved by equal amounts, by the bits that stay at a depth.
 
         `among` [N]: those that did at a larger depth, where steps are less exact.
         """
-        rows = self.order if among is None else self.order[among[self.order]]
+        rows, alike = self.order, self.alike
+        if among is not None:
+            rows, alike = rows[among[rows]], alike[among[alike[:, 0]]]
         apart = np.zeros(len(self.order), bool)
 
         def mark(start: int, stop: int) -> None:
-            own = rows[start:stop]
-            _mark(own, self.near, *self.words, depth, _COLOURS, _EQUAL, apart)
-            _mark(own, self.alike, *self.words, depth, 0, _MANY_EQUAL, apart)
+            _mark(self._pairs(rows[start:stop], _COLOURS, _ZERO), *self.words, depth, apart)
 
         in_blocks(mark, len(rows), _ROWS, _mark)
+        _mark(alike, *self.words, depth, apart)
         return apart
 
     def chance(self, depth: int, usable: Flags) -> float:
@@ -90,25 +89,33 @@ class Steps:
 
         rows, random, chances = self.order[usable[self.order]], np.random.default_rng(0), [1.0]
         rows = rows[:: max(1, len(rows) // _SAMPLE)]
+        pairs = self._pairs(rows, _COLOURS)
+        pairs = pairs[(pairs[:, 1] < 0) | (pairs[:, 0] < pairs[:, 1])]  # each counts once
         found, count = np.empty((0, 7), np.uint32), 0
         while count == len(found):
             found = np.empty((2 * len(found) + len(rows) + 1, 7), np.uint32)
-            count = _pairs(rows, self.near, *self.words, depth, found)
+            count = _list(pairs, *self.words, depth, found)
         for kind in _KINDS:
             own = found[:count][found[:count, 6] == kind]
-            words, pairs = own[:, :4], own[:, 4:6]
-            written = usable[np.tile(pairs, 2)]
+            words, written = own[:, :4], usable[np.tile(own[:, 4:6], 2)]
             hits, drawn = _hits(words, depth), np.zeros(len(_PARTS))
             for _ in range(_DRAWS):
                 drawn += _hits(redrawn(words, written, depth, random), depth)
             chances += pdtrc(hits - 1.0, np.maximum(drawn, 1) / _DRAWS)[hits > 0].tolist()
         return min(1.0, min(chances) * len(_KINDS) * len(_PARTS))
 
+    def _pairs(self, rows: Integers, *others: int) -> Integers:
+        """[P, 2] pairs of `rows` [R] with `others` and with their nearest neighbours."""
+        every = [np.full((len(rows), 1), other) for other in others] + [self.near[rows]]
+        beside = np.concatenate(every, axis=1)
+        return np.stack([rows.repeat(beside.shape[1]), beside.ravel()], axis=1)
+
 
 def moved_from_zero(gaussians: Gaussians, layout: Layout) -> Flags:
     """Mask [N] of Gaussians whose numbers moved by equal amounts away from zero, at the least depth."""
-    apart, none = np.zeros(len(gaussians), bool), np.empty((len(gaussians), 0), np.int32)
-    _mark(np.arange(len(apart)), none, *_words(gaussians, layout), LEAST, _ZERO, _EQUAL, apart)
+    apart = np.zeros(len(gaussians), bool)
+    pairs = np.stack([np.arange(len(apart)), np.full(len(apart), _ZERO)], axis=1)
+    _mark(pairs, *_words(gaussians, layout), LEAST, apart)
     return apart
 
 
@@ -132,28 +139,26 @@ def _words(gaussians: Gaussians, layout: Layout) -> tuple[Words32, Words32]:
     return bit_patterns(geometry).reshape(geometry.shape), bit_patterns(sh).reshape(sh.shape)
 
 
-def _alike(geometry: Words32, sh: Words32) -> Integers:
-    """[N, 4 _ALIKE] Gaussians with nearly equal sums or differences of three numbers, for all signs of steps.
+def _alike(sh: Words32) -> Integers:
+    """[P, 2] Gaussians in which the harmonics of degree 1 of a colour may have moved by equal amounts.
 
-    The numbers are the mean harmonics of degree 1 or, at SH degree 0, the log scales.
+    For any signs of the steps, two sums or differences are equal, up to the precision of the bits that stay.
     """
-    numbers = (sh[:, 1:4] if sh.shape[1] > 1 else geometry[:, :3, :1]) & ~LOW
-    means = np.nan_to_num(numbers.view(np.float32).astype(np.float64), posinf=0, neginf=0).mean(axis=2)
-    kept = [means[:, :1] - means[:, 1:] * signs for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
-    count = min(_ALIKE, max(0, len(means) - 1))
 
-    def search(index: int, _: int) -> Integers:
-        flat = np.pad(kept[index], ((0, 0), (0, 1))).astype(np.float32)
-        order = morton_order(flat)  # what neighbours share stays in the cache
-        found = np.empty((len(order), count), np.int64)
-        found[order] = order[nearest_neighbours(kept[index][order], count + 1)[1][:, 1:]]
-        return found
+    def search(colour: int, _: int) -> Integers:
+        words, pairs = np.ascontiguousarray(sh[:, 1:4, colour].T), list[Integers]()
+        numbers = (words & ~LOW | (LOW + 1) >> 1).view(np.float32)
+        cells = (words & _EXPONENT).view(np.float32).max(axis=0) * np.float32(2.0 ** (DEEPEST + 2 - 23))
+        for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+            with np.errstate(over="ignore", invalid="ignore"):
+                one, other = (numbers[0] + sign * numbers[at] for at, sign in enumerate(signs, 1))
+            order = one.argsort()
+            found = np.empty((_ALIKE * len(order), 2), np.int64)
+            pairs.append(order[found[: _meet(one[order], other[order], cells[order], found)]])
+        return np.concatenate(pairs)
 
-    near = [np.empty((len(means), 0), np.int64)]
-    if count:
-        near += in_blocks(search, len(kept), 1)
-    alike: Integers = np.concatenate(near, axis=1)
-    return alike
+    colours = in_blocks(search, 3 if sh.shape[1] > 1 else 0, 1, _meet)
+    return np.concatenate([np.empty((0, 2), np.int64), *colours])
 
 
 def _hits(words: Words32, depth: int) -> Integers:
@@ -163,6 +168,21 @@ def _hits(words: Words32, depth: int) -> Integers:
     cells = (words & _EXPONENT).view(np.float32).max(axis=1) * 2.0 ** (depth + 1 - 23)
     counts: Integers = (abs(steps[:, 1] - steps[:, 0]) < _PARTS * cells).sum(axis=1)
     return counts
+
+
+@kernel
+def _meet(first: Any, second: Any, cells: Any, found: Any) -> int:
+    """List pairs of points (first, second), by ascending `first`, that agree within `cells` [N]; how many."""
+    count = 0
+    for one in range(len(first)):
+        most = count + _ALIKE
+        for other in range(one + 1, min(one + _FURTHER, len(first))):
+            if count == most or first[other] - first[one] >= cells[one]:
+                break
+            if abs(second[other] - second[one]) < cells[one]:
+                found[count, 0], found[count, 1] = one, other
+                count += 1
+    return count
 
 
 @inline
@@ -178,13 +198,18 @@ def _read(geometry: Any, sh: Any, row: Any, words: Any) -> None:
 
 
 @inline
-def _rotate(x: Any, y: Any, quats: Any) -> None:
-    """Set `y` [groups, _LANES] to the next colours of x, with its signs; geometry is equal to nothing."""
-    for group in range(len(x)):
-        source = quats + (group - quats + 1) % 3
+def _read_other(geometry: Any, sh: Any, row: Any, x: Any, y: Any) -> None:
+    """Set `y` [groups, _LANES] to the numbers of what a Gaussian with the numbers x is compared with.
+
+    For _COLOURS, the next colours, with the signs of x; geometry is equal to nothing.
+    """
+    if row >= 0:
+        _read(geometry, sh, row, y)
+    for group in range(len(x) if row < 0 else 0):
+        source = geometry.shape[2] + (group - geometry.shape[2] + 1) % 3
         for at in range(_LANES):
-            y[group, at] = _NAN
-            if group >= quats:
+            y[group, at] = np.uint32(0) if row == _ZERO else _NAN
+            if row == _COLOURS and group >= geometry.shape[2]:
                 y[group, at] = x[source, at] & _MAGNITUDE | x[group, at] & ~_MAGNITUDE
 
 
@@ -207,86 +232,75 @@ def _compare(x: Any, y: Any, depth: Any, known: Any, steps: Any, cells: Any) -> 
             cells[group, at] = numbers[2, group, at] * share
 
 
-@kernel
-def _mark(
-    rows: Any, near: Any, geometry: Any, sh: Any, depth: int, first: int, least: int, apart: Any
-) -> None:
-    """Set `apart` [N] for pairs of a row and one of its neighbours in `near` [N, K].
+@inline
+def _most_equal(steps: Any, cells: Any, group: Any, lanes: Any) -> Any:
+    """The largest number of equal steps among the first `lanes` of a group."""
+    most = np.int32(0)
+    for at in range(lanes):
+        agree = np.int32(0)
+        for each in range(lanes):
+            cell = max(cells[group, at], cells[group, each])
+            agree += np.int32(abs(steps[group, at] - steps[group, each]) <= cell)
+        most = max(most, agree)
+    return most
 
-    `least`: equal steps of harmonics. `first`: what comes before neighbours, _COLOURS and _ZERO, _ZERO, or 0
-    for neither.
-    """
-    groups = geometry.shape[2] + 3 * (sh.shape[1] > 1)
+
+@kernel
+def _mark(pairs: Any, geometry: Any, sh: Any, depth: int, apart: Any) -> None:
+    """Set `apart` [N] for `pairs` [P, 2] in which _EQUAL numbers of a group moved by equal amounts."""
+    groups, last = geometry.shape[2] + 3 * (sh.shape[1] > 1), -1
     x = np.full((groups, _LANES), _NAN, np.uint32)  # unused lanes are equal to nothing
     y, known = np.zeros((groups, _LANES), np.uint32), np.empty((3, groups, _LANES), np.uint32)
     steps, cells = np.empty((groups, _LANES), np.float32), np.empty((groups, _LANES), np.float32)
-    for one in rows:
-        _read(geometry, sh, one, x)
-        for place in range(first, near.shape[1]):
-            other = one if place < 0 else near[one, place]
-            if (apart[one] and apart[other]) or (place >= 0 and other == one):
-                continue
-            seen = False  # a pair of mutual neighbours is judged once
-            for each in range(near.shape[1] if other < one else 0):
-                seen |= near[other, each] == one
-            if seen:
-                continue
-            if place >= 0:
-                _read(geometry, sh, other, y)
-            elif place == _ZERO:
-                y[:] = 0
+    for pair in range(len(pairs)):
+        one, other = pairs[pair]
+        if apart[one] and (other < 0 or apart[other]):
+            continue
+        if one != last:
+            _read(geometry, sh, one, x)
+            last = one
+        _read_other(geometry, sh, other, x, y)
+        _compare(x, y, depth, known, steps, cells)
+        equal = False
+        for group in range(groups):
+            if group < geometry.shape[2]:
+                equal |= _most_equal(steps, cells, group, _FEW) >= _EQUAL
             else:
-                _rotate(x, y, geometry.shape[2])
-            _compare(x, y, depth, known, steps, cells)
-            for group in range(groups):
-                most = np.int32(0)
-                for at in range(_LANES):
-                    agree = np.int32(0)
-                    for each in range(_LANES):
-                        cell = max(cells[group, at], cells[group, each])
-                        agree += np.int32(abs(steps[group, at] - steps[group, each]) <= cell)
-                    most = max(most, agree)
-                enough = _EQUAL if group < geometry.shape[2] else min(least, sh.shape[1] - 1)
-                if most >= enough:
-                    apart[one] = apart[other] = True
-                    break
+                equal |= _most_equal(steps, cells, group, _LANES) >= _EQUAL
+        if equal:
+            apart[one] = True
+            if other >= 0:
+                apart[other] = True
 
 
 @kernel
-def _pairs(rows: Any, near: Any, geometry: Any, sh: Any, depth: int, found: Any) -> int:
-    """List pairs of numbers that differ by equal steps between `rows` and their neighbours; how many.
+def _list(pairs: Any, geometry: Any, sh: Any, depth: int, found: Any) -> int:
+    """List two numbers that differ by equal steps in `pairs` [P, 2]; how many.
 
-    The next colour counts as a neighbour. `found` [M, 7]: first number of row and neighbour, second number,
-    row and neighbour, kind. Lists at most M. Steps of up to two cells are small by chance.
+    `found` [M, 7]: first number of both Gaussians, second number, the Gaussians (one for _COLOURS), kind.
+    Lists at most M. Steps of up to two cells are small by chance.
     """
     groups, count = geometry.shape[2] + 3 * (sh.shape[1] > 1), 0
     x, y = np.full((groups, _LANES), _NAN, np.uint32), np.zeros((groups, _LANES), np.uint32)
     known = np.empty((3, groups, _LANES), np.uint32)
     steps, cells = np.empty((groups, _LANES), np.float32), np.empty((groups, _LANES), np.float32)
-    for one in rows:
+    for pair in range(len(pairs)):
+        one, other = pairs[pair]
         _read(geometry, sh, one, x)
-        for place in range(-1, near.shape[1]):
-            other = one if place < 0 else near[one, place]
-            if place < 0:
-                _rotate(x, y, geometry.shape[2])
-            elif other <= one:  # each pair counts once
-                continue
-            else:
-                _read(geometry, sh, other, y)
-            _compare(x, y, depth, known, steps, cells)
-            for group in range(groups):
-                for at in range(_LANES):
-                    for each in range(at):
-                        cell = max(cells[group, at], cells[group, each])
-                        step = steps[group, at]
-                        if abs(step - steps[group, each]) <= cell and step > 2 * cell:
-                            if count == len(found):
-                                return count
-                            row = found[count]
-                            row[0], row[1] = x[group, at], y[group, at]
-                            row[2], row[3] = x[group, each], y[group, each]
-                            row[4], row[5], row[6] = one, other, _GEOMETRY
-                            if group >= geometry.shape[2]:
-                                row[6] = _HARMONICS if place >= 0 else _BETWEEN_COLOURS
-                            count += 1
+        _read_other(geometry, sh, other, x, y)
+        _compare(x, y, depth, known, steps, cells)
+        for group in range(groups):
+            for at in range(_LANES):
+                for each in range(at):
+                    cell, step = max(cells[group, at], cells[group, each]), steps[group, at]
+                    if abs(step - steps[group, each]) <= cell and step > 2 * cell:
+                        if count == len(found):
+                            return count
+                        row = found[count]
+                        row[0], row[1] = x[group, at], y[group, at]
+                        row[2], row[3] = x[group, each], y[group, each]
+                        row[4], row[5], row[6] = one, max(one, other), _GEOMETRY
+                        if group >= geometry.shape[2]:
+                            row[6] = _HARMONICS if other >= 0 else _BETWEEN_COLOURS
+                        count += 1
     return count

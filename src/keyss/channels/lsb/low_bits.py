@@ -34,8 +34,9 @@ from keyss.channels.lsb.low_bits_capacity import (
     key_message,
     parameter_message,
 )
+from keyss.channels.lsb.salts import salt, salt_rows
 from keyss.channels.lsb.shards import Shards, is_tagged, shard_bytes
-from keyss.channels.lsb.usable import Carriers, repeated, salt, salt_rows
+from keyss.channels.lsb.usable import Carriers, repeated
 from keyss.channels.mixing import random_order
 from keyss.channels.reed_solomon import Codewords
 from keyss.core.arrays import Bytes, Flags, Integers
@@ -114,14 +115,13 @@ class LowBitsCover:
     @cached_property
     def _usable(self) -> Flags:
         """[N] mask of usable Gaussians, without those of salts."""
-        usable = self.carriers.usable[LEAST].copy()
+        usable = self.carriers.usable.copy()
         usable[self.salt_rows] = False
         return usable
 
     @cached_property
     def _capacity(self) -> LowBitsCapacity:
-        count, depths = int(self._usable.sum()), tuple(self.carriers.usable)
-        return LowBitsCapacity(len(self.cover), count, self.layout, depths)
+        return LowBitsCapacity(len(self.cover), int(self._usable.sum()), self.layout, self.carriers.depth)
 
     def _salts(self, entropy: bytes) -> tuple[Bytes, list[bytes]]:
         """New low bits [F, B] of the Gaussians of fresh salts, and all salts with these low bits."""

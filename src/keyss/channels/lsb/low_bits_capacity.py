@@ -24,9 +24,9 @@ import numpy as np
 from keyss.channels.base import Capacity, first_shares
 from keyss.channels.container import MAX_OVERHEAD, PARAMETER_BYTES, Parameters
 from keyss.channels.foreign import EXACT_BYTES
-from keyss.channels.lsb.bits import DEPTHS, LEAST, Layout
+from keyss.channels.lsb.bits import DEEPEST, DEPTHS, LEAST, Layout
+from keyss.channels.lsb.salts import SALTS
 from keyss.channels.lsb.shards import Message, false_shards, groups_of, is_tagged, shard_bytes, whole_groups
-from keyss.channels.lsb.usable import SALTS
 from keyss.channels.reed_solomon import LOST, Codewords
 from keyss.core.errors import InputError, UsageError
 
@@ -75,12 +75,12 @@ class Plan:
 
 @dataclass(frozen=True)
 class LowBitsCapacity:
-    """The capacity of the low bits of a model of `gaussians`, so many of them `carriers`, at `depths`."""
+    """The capacity of the low bits of a model of `gaussians`, so many of them `carriers`, up to `depth`."""
 
     gaussians: int
     carriers: int
     layout: Layout
-    depths: tuple[int, ...] = DEPTHS
+    depth: int = DEEPEST
 
     @staticmethod
     def of(gaussians: int, layout: Layout) -> LowBitsCapacity:
@@ -134,6 +134,10 @@ class LowBitsCapacity:
         )
 
     @property
+    def _depths(self) -> list[int]:
+        return [depth for depth in DEPTHS if depth <= self.depth]
+
+    @property
     def _shares(self) -> list[Share]:
         """The shares that a secret may get, in the order of capacity.
 
@@ -142,7 +146,7 @@ class LowBitsCapacity:
         reserved, shares = MAX_INDEPENDENT * self.header_carriers, list[Share]()
         if reserved > _MAX_RESERVED * self.carriers:
             return []
-        for part, depth in ((0.25, LEAST), (0.5, LEAST), *((1.0, depth) for depth in self.depths)):
+        for part, depth in ((0.25, LEAST), (0.5, LEAST), *((1.0, depth) for depth in self._depths)):
             share = self._share(part, int(part * (self.carriers - reserved)), depth)
             if share and (not shares or share.codewords.size > shares[-1].codewords.size):
                 shares.append(share)
@@ -151,7 +155,7 @@ class LowBitsCapacity:
     def _equal(self, secrets: int) -> list[Share]:
         """Equal shares of `secrets`, at each depth."""
         count = self.carriers // secrets - self.header_carriers
-        shares = [self._share(1 / secrets, count, depth) for depth in self.depths]
+        shares = [self._share(1 / secrets, count, depth) for depth in self._depths]
         return [share for share in shares if share]
 
     def _share(self, part: float, count: int, depth: int) -> Share | None:

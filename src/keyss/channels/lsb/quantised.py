@@ -32,8 +32,8 @@ from keyss.channels.lsb.fields import (
     model_hash,
     with_levels,
 )
+from keyss.channels.lsb.salts import salt
 from keyss.channels.lsb.shards import parameter_pads
-from keyss.channels.lsb.usable import salt
 from keyss.channels.lsb.writable_levels import fixed_axes, writable_levels
 from keyss.channels.mixing import random_fractions, random_order, random_words
 from keyss.core.arrays import Bits, Bytes, Flags, Integers

@@ -1,4 +1,4 @@
-"""Usable Gaussians, whose low bits can be replaced without a trace, and those that give the salts.
+"""Usable Gaussians, whose low bits can be replaced without a trace.
 
 In a trained model most low bits are uniformly random to anybody who does not know the training, but not all.
 A Gaussian is excluded as a whole, so that its numbers stay consistent, because of:
@@ -14,18 +14,11 @@ A Gaussian is excluded as a whole, so that its numbers stay consistent, because 
 - *Short numbers*, five in a Gaussian, as of models in half precision.
 - *Small even numbers*, which an optimiser may have left on a coarser grid: see `trailing_zeros`.
 
-All but the last two are found in bits that embedding never changes. docs/threat-model.md tells what each
-hides.
-
-A *salt* of Argon2id is a hash of one Gaussian and its low bits, which are new random bits for every file and
-carry nothing else: no two files of one cover share a salt. There are several salts because Gaussians may be
-removed. Their order does not change by embedding: Gaussians come late that moved by equal steps away from
-zero or have small even numbers, which are often not usable; else the smallest IDs come first.
+docs/threat-model.md tells what each hides.
 """
 
 from __future__ import annotations
 
-import hashlib
 import math
 from dataclasses import dataclass
 
@@ -45,20 +38,16 @@ from keyss.channels.lsb.bits import (
     coarse_lengths,
     gaussian_ids,
     group_words,
-    read_low_bits,
     used_words,
 )
-from keyss.channels.lsb.equal_steps import Steps, moved_from_zero
+from keyss.channels.lsb.equal_steps import Steps
 from keyss.channels.lsb.trailing_zeros import count_trailing_zeros, least_exponent
 from keyss.channels.mixing import row_hashes
 from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Numbers, Words, Words32
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.kernels.parallel import in_blocks
-from keyss.keys.derivation import SALT_BYTES
 
-SALTS = 12  # random pruning of a quarter removes all their Gaussians with p = 6e-8
-_LABEL = b"keyss/v3/salt"
 # Maximum squared separation (d') of a plain file and one with new bits by small numbers, for an attacker who
 # knows the trainer and the plain file's statistics. 0.03 is an AUC of 0.55.
 MAX_SEPARATION = 0.03
@@ -75,8 +64,6 @@ _OPACITY = 7
 _SATURATED = np.uint32(0x41800000), np.uint32(0x80000000)
 _PRUNED = np.float32(math.log(0.005 / 0.995)).view(np.uint32) | LOW  # the logit of 0.005, without low bits
 _MIN_USABLE = 0.05  # share of the Gaussians of a cover
-_LARGE_ENOUGH = 118  # biased exponent: optimisers with large last steps leave zeros in numbers below 2^-9
-_FIRST = 1 << 12  # smallest IDs, enough for the salts of most models
 _SHORT = 5  # numbers without low bits; by chance in one of ten million Gaussians
 _SETS_BY_CHANCE = 0.1  # maximum expected number of sets of equal values by chance
 _SAMPLE = 20_000  # Gaussians whose bits are tested
@@ -88,39 +75,38 @@ _CHANCE = 1e-6  # probability of refusing a depth of a model with uniform bits
 
 @dataclass(frozen=True)
 class Carriers:
-    """The Gaussians of a cover that may be written, by depth."""
+    """The Gaussians of a cover that may be written."""
 
     ids: Bytes  # [N, 16] of all Gaussians
-    usable: dict[int, Flags]  # [N] the same mask for each depth at which new low bits do not show
+    usable: Flags  # [N] mask of those in which new low bits do not show
+    depth: int  # up to which they do not
     renewable: Flags  # [N] mask of those that may be written at the least depth, as salts are
 
     @staticmethod
     def of(gaussians: Gaussians, layout: Layout) -> Carriers:
         """Raises UsageError, with what shows, if new low bits would show even at the least depth.
 
-        A sample of a large cover is tested first: the whole takes a second for each 50,000 Gaussians.
+        A sample of a large cover is tested first: the whole takes a second for each 100,000 Gaussians.
         """
         if len(gaussians) > _LARGE:
             sample = gaussians[:: len(gaussians) // _SAMPLE]
             Carriers.of(sample, Layout.of(sample))
-        ids = gaussian_ids(gaussians, layout)
-        steps = Steps(gaussians, layout)
+        ids, steps = gaussian_ids(gaussians, layout), Steps(gaussians, layout)
         fine, apart = _without_copies(gaussians, layout, ids), steps.equal(DEEPEST)
         fine &= _large_enough(gaussians, layout, fine & ~apart)
-        usable = fine & ~apart
-        written = dict[int, Flags]()
+        usable, deepest = fine & ~apart, 0
         for depth in DEPTHS:
             if told := _what_tells(gaussians, layout, usable, depth, steps):
                 if depth == LEAST:
                     raise UsageError(told)
                 break
-            written[depth] = usable
-        return Carriers(ids, written, fine & ~steps.equal(LEAST, apart))
+            deepest = depth
+        return Carriers(ids, usable, deepest, fine & ~steps.equal(LEAST, apart))
 
 
 def usable_carriers(gaussians: Gaussians) -> Flags:
     """Mask [N] of the usable Gaussians. Raises UsageError as `Carriers.of`."""
-    return Carriers.of(gaussians, Layout.of(gaussians)).usable[LEAST]
+    return Carriers.of(gaussians, Layout.of(gaussians)).usable
 
 
 def _what_tells(gaussians: Gaussians, layout: Layout, usable: Flags, depth: int, steps: Steps) -> str:
@@ -143,7 +129,7 @@ def _what_tells(gaussians: Gaussians, layout: Layout, usable: Flags, depth: int,
                 f"the low bits of {name} in this cover are not random (p = {chance:.0e}), and new ones "
                 "would be seen: the cover was quantised, scaled or moved after its training"
             )
-    if depth == LEAST and (chance := chance_of_lattice(used, layout)) < _CHANCE:
+    if depth == LEAST and (chance := chance_of_lattice(used)) < _CHANCE:
         return (
             f"numbers of this cover are multiples of one step (p = {chance:.0e}), and new low bits would be "
             "seen: its colours were multiplied after training, as an edit of their brightness does"
@@ -177,23 +163,19 @@ def chance_of_bits(words: Words32, bits: int) -> float:
     return min(1.0, float(every.min() * len(every)))
 
 
-def chance_of_lattice(used: Words32, layout: Layout) -> float:
-    """p-value of mantissas on a lattice, for uniform ones; `used` [N, F].
+def chance_of_lattice(used: Words32) -> float:
+    """p-value of harmonics on a lattice, for uniform mantissas; `used` [N, F].
 
     A factor that is no power of two maps the floats of one exponent to a lattice, whose period shows in the
     power spectrum of the counts of mantissas (Welch 1967). Bonferroni-corrected, over the most frequent
-    exponent of each attribute and colour.
+    exponent of each colour.
     """
     from scipy.fft import rfft  # both take long to load
     from scipy.special import gammaincc
 
-    columns = [np.arange(GEOMETRY)[group] for name, group in _GROUPS.items() if name != "harmonics"]
-    columns += [np.arange(GEOMETRY + colour, used.shape[1], 3) for colour in range(3)]
     chances = [1.0]
-    for group in columns:
-        words = used[:, np.intersect1d(group, layout.columns)].ravel()
-        if not len(words):
-            continue
+    for colour in range(3 if used.shape[1] > GEOMETRY else 0):
+        words = used[:, GEOMETRY + colour :: 3].ravel()
         exponents = _exponents(words)
         words = words[exponents == np.bincount(exponents).argmax()]
         mantissas = (words >> np.uint32(1)) & np.uint32(_MANTISSAS - 1)  # the last bit is never written
@@ -202,45 +184,8 @@ def chance_of_lattice(used: Words32, layout: Layout) -> float:
         # Of uniform mantissas, the power has the mean and at most the variance of a gamma distribution.
         total, squares = len(words), float((counts.sum(axis=1, dtype=np.float64) ** 2).sum())
         shape = total**2 / squares
-        chances.append(gammaincc(shape, shape * float(powers.max()) / total) * len(powers))
-    return float(min(1.0, min(chances) * len(columns)))
-
-
-def salt_rows(gaussians: Gaussians, ids: Bytes, layout: Layout) -> Integers:
-    """Rows of the salts' Gaussians, at most SALTS, in the order of the salts; `ids` [N, 16]."""
-    numbers = ids[:, :8].copy().view(">u8")[:, 0].astype(np.uint64)
-    rows = np.argpartition(numbers, _FIRST)[:_FIRST] if len(ids) > _FIRST else np.arange(len(ids))
-    late = _lateness(gaussians[torch.from_numpy(rows)], layout)
-    if (late == 0).sum() < SALTS:  # of the smallest IDs too few
-        rows, late = np.arange(len(ids)), _lateness(gaussians, layout)
-    keys = late << np.uint64(56) | numbers[rows] >> np.uint64(8)
-    best = np.argpartition(keys, SALTS - 1)[:SALTS] if len(keys) > SALTS else np.arange(len(keys))
-    low = read_low_bits(gaussians[torch.from_numpy(rows[best])], LEAST, layout)
-    places = [
-        (late[each], ids[rows[each]].tobytes(), own.tobytes()) for each, own in zip(best, low, strict=True)
-    ]
-    return rows[best[sorted(range(len(best)), key=places.__getitem__)]]
-
-
-def _lateness(gaussians: Gaussians, layout: Layout) -> Words:
-    """[N] octaves by which the smallest even number lies below _LARGE_ENOUGH, 0 for larger ones.
-
-    255 for Gaussians that moved by equal steps away from zero.
-    """
-
-    def work(start: int, stop: int) -> Words:
-        used = used_words(gaussians[start:stop])[:, layout.columns]
-        below = np.where(used & 1 == 0, _LARGE_ENOUGH - _exponents(used).astype(np.int64), 0)
-        smallness: Words = below.max(axis=1, initial=0).astype(np.uint64)
-        return smallness
-
-    small = np.concatenate([np.zeros(0, np.uint64), *in_blocks(work, len(gaussians), BLOCK)])
-    return np.where(moved_from_zero(gaussians, layout), np.uint64(255), small)
-
-
-def salt(carrier_id: Bytes, low: Bytes) -> bytes:
-    """The salt of one carrier: SALT_BYTES."""
-    return hashlib.sha256(_LABEL + carrier_id.tobytes() + low.tobytes()).digest()[:SALT_BYTES]
+        chances.append(3 * len(powers) * gammaincc(shape, shape * float(powers.max()) / total))
+    return float(min(chances))
 
 
 def frequent(words: Numbers, times: int) -> Numbers:
@@ -289,7 +234,7 @@ def _without_copies(gaussians: Gaussians, layout: Layout, ids: Bytes) -> Flags:
         for group, values in zip(_GROUPS.values(), common, strict=True):
             good[:, group] &= ~among(used[:, group], values)
         high = ((used & _MAGNITUDE) >> np.uint32(DEEPEST + 1)).astype(np.int32)
-        triples = np.concatenate([high[:, :3], high[:, GEOMETRY:]], axis=1).reshape(len(used), -1, 3)
+        triples = np.delete(high, slice(3, GEOMETRY), axis=1).reshape(len(used), -1, 3)
         near = np.abs(triples - triples[:, :, [1, 2, 0]]) <= 1
         fine[start:stop] = good[:, layout.columns].all(axis=1) & ~near.any(axis=(1, 2))
         fine[start:stop] &= (used[:, layout.columns] & LOW == 0).sum(axis=1) < _SHORT

@@ -71,11 +71,12 @@ def invariants(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
         if not numbers.size:
             continue
         trained = words.trained[:, words.of_attribute(index)]
-        statistics[f"short numbers, {attribute}"] = portion(float((~trained).sum()), trained.size)
-        fields = zip(numbers.T, trained.T, strict=True)
-        counts = [np.unique(values[kept], return_counts=True)[1] for values, kept in fields]
-        repeated = sum(int(count[count > 1].sum()) for count in counts)
-        statistics[f"repeated values, {attribute}"] = portion(repeated, numbers.size)
+        statistics[f"short numbers, {attribute}"] = portion((~trained).sum(axis=1), trained.shape[1])
+        repeated = np.zeros(len(numbers))
+        for values, kept in zip(numbers.T, trained.T, strict=True):
+            _, inverse, counts = np.unique(values[kept], return_inverse=True, return_counts=True)
+            repeated[kept] += counts[inverse] > 1
+        statistics[f"repeated values, {attribute}"] = portion(repeated, numbers.shape[1])
         clusters = [_clusters(values.view(np.float32).astype(np.float64)) for values in numbers.T]
         hits, trials = (sum(counted) for counted in zip(*clusters, strict=True))
         statistics[f"clusters of values, {attribute}"] = excess(hits, trials, _CLUSTERED)
@@ -87,7 +88,7 @@ def _lengths(model: Gaussians) -> dict[str, Statistic]:
     error = (model.quats.detach().cpu().double().norm(dim=1) - 1).abs().numpy()
     unit = error < _UNIT
     statistics = {
-        "quaternions of unit length": portion(float(unit.sum()), len(unit)),
+        "quaternions of unit length": portion(unit),
         "quaternions of nearly unit length": near_misses(error, unit, _MOVED, _AROUND),
         "distance of quaternions from unit length, median": Statistic(
             float(np.log10(np.median(error) + 1e-9))
@@ -142,7 +143,8 @@ def order(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
         statistics[f"neighbouring rows, {name}"] = normal(float(jumps), 0.2236 / math.sqrt(count), 1 / 3)
     positions = doubles(model.means)
     size = float(np.linalg.norm(np.subtract(*np.quantile(positions, (0.9, 0.1), axis=0)))) or 1.0
-    statistics["near duplicates"] = portion(_pairs_within(positions, _NEAR * size), count)
+    pairs = _pairs_within(positions, _NEAR * size)
+    statistics["near duplicates"] = Statistic(pairs / count, math.sqrt(max(pairs, 1)) / count)
     return statistics
 
 
@@ -215,7 +217,7 @@ def opacities(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     """Shares of ranges of opacity, and differences between faint and other Gaussians."""
     logits = doubles(model.opacity_logits)
     statistics = {
-        f"share of opacities, {name}": portion(float(((logits >= low) & (logits < high)).sum()), len(logits))
+        f"share of opacities, {name}": portion((logits >= low) & (logits < high))
         for name, (low, high) in _SHARES.items()
     }
     statistics["modes of faint opacities"] = Statistic(float(len(_modes(logits[logits < _FAINT]))))

@@ -162,19 +162,25 @@ def agreement(model: Gaussians, words: BitPatterns) -> dict[str, Statistic]:
     for name, attributes in _GROUPS.items():
         pairs = list(_pairs_within_gaussians(words, attributes))
         if pairs:
-            one, other = (np.concatenate(side) for side in zip(*pairs, strict=True))
-            statistics |= {f"{key}, {name}": statistic for key, statistic in _of_pairs(one, other).items()}
+            one, other = (np.concatenate(side, axis=1) for side in zip(*pairs, strict=True))
+            of_pairs = _of_pairs(one, other, np.arange(len(one)))
+            statistics |= {f"{key}, {name}": statistic for key, statistic in of_pairs.items()}
     harmless = words.attribute > 0
     for name, rows in (
         ("neighbours", nearest_pairs(doubles(model.means), _NEIGHBOURS)),
         ("sharers", _sharers(words)),
     ):
-        one, other = (words.bits[rows[:, side]][:, harmless].ravel() for side in (0, 1))
-        statistics |= {f"{key}, {name}": statistic for key, statistic in _of_pairs(one, other).items()}
+        one, other = (words.bits[rows[:, side]][:, harmless] for side in (0, 1))
+        of_pairs = _of_pairs(one, other, rows[:, 0])
+        statistics |= {f"{key}, {name}": statistic for key, statistic in of_pairs.items()}
     return statistics
 
 
-def _of_pairs(one: Words32, other: Words32) -> dict[str, Statistic]:
+def _of_pairs(one: Words32, other: Words32, gaussians: Integers) -> dict[str, Statistic]:
+    """Statistics of pairs of numbers [P, C]; `gaussians` [P]: index of a Gaussian of each row."""
+    alike = np.bincount(gaussians, (one == other).sum(axis=1))
+    trials = np.bincount(gaussians) * one.shape[1]
+    one, other = one.ravel(), other.ravel()
     distance = ulps(one, other)
     same_high = (one >> _LOW) == (other >> _LOW)
     equal = distance == 0
@@ -186,7 +192,7 @@ def _of_pairs(one: Words32, other: Words32) -> dict[str, Statistic]:
         ),
         "equal low bits": excess(int(equal[same_high].sum()), int(same_high.sum()), 1 / size),
         "near misses": near_misses(distance, equal, _MOVED, _AROUND),
-        "equal": portion(float(equal.sum()), len(equal)),
+        "equal": portion(alike, trials),
         "within a quarter of an octave": _within_quarters(one, other),
     }
 
@@ -203,7 +209,7 @@ def _within_quarters(one: Words32, other: Words32) -> Statistic:
 def _pairs_within_gaussians(
     words: BitPatterns, attributes: tuple[int, ...]
 ) -> Iterator[tuple[Words32, Words32]]:
-    """Pairs of magnitudes in one Gaussian, within a coefficient's channels or an attribute."""
+    """Pairs [N, C] of magnitudes in one Gaussian, within a coefficient's channels or an attribute."""
     for attribute in attributes:
         magnitudes = words.bits[:, words.of_attribute(attribute)] & np.uint32(0x7FFFFFFF)
         if not magnitudes.size:
@@ -211,7 +217,7 @@ def _pairs_within_gaussians(
         width = 4 if attribute == 2 else 3
         groups = magnitudes.reshape(len(magnitudes), -1, width)
         for first, second in combinations(range(width), 2):
-            yield groups[:, :, first].ravel(), groups[:, :, second].ravel()
+            yield groups[:, :, first], groups[:, :, second]
 
 
 def nearest_pairs(positions: Doubles, neighbours: int) -> Integers:

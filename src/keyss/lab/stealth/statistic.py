@@ -97,10 +97,17 @@ def excess(hits: int, trials: int, expected: float) -> Statistic:
     return Statistic(hits / mean, math.sqrt(max(hits, mean, 1.0)) / mean, p)
 
 
-def portion(hits: float, trials: int) -> Statistic:
-    """A share without a null hypothesis, with the binomial error of at least one hit and one miss."""
-    trials = max(trials, 1)
-    return Statistic(hits / trials, math.sqrt(max(hits, 1.0) * max(trials - hits, 1.0) / trials) / trials)
+def portion(hits: Numbers, trials: Numbers | int = 1) -> Statistic:
+    """The share of `hits` [G] in `trials` [G], without a null hypothesis.
+
+    Its error, at least that of one hit, comes from the differences between G groups: the numbers of a
+    Gaussian are hits together, for example of a copy.
+    """
+    total = float(np.broadcast_to(trials, hits.shape).sum())
+    if total == 0:
+        return NOTHING
+    value = float(hits.sum()) / total
+    return Statistic(value, math.sqrt(max(float(np.square(hits - value * trials).sum()), 1.0)) / total)
 
 
 def near_misses(distance: Numbers, equal: Flags, moved: float, around: float) -> Statistic:

@@ -1,0 +1,65 @@
+"""Salts of Argon2id, in the low bits of Gaussians.
+
+A *salt* is a hash of one Gaussian and its low bits, which are new random bits for every file and
+carry nothing else: no two files of one cover share a salt. There are several salts because Gaussians may be
+removed. Their order does not change by embedding: Gaussians come late that moved by equal steps away from
+zero or have small even numbers, which are often not usable; else the smallest IDs come first.
+"""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import torch
+
+from keyss.channels.lsb.bits import BLOCK, LEAST, Layout, read_low_bits, used_words
+from keyss.channels.lsb.equal_steps import moved_from_zero
+from keyss.core.arrays import Bytes, Integers, Words
+from keyss.core.gaussians import Gaussians
+from keyss.kernels.parallel import in_blocks
+from keyss.keys.derivation import SALT_BYTES
+
+SALTS = 12  # random pruning of a quarter removes all their Gaussians with p = 6e-8
+_LABEL = b"keyss/v3/salt"
+_LARGE_ENOUGH = 118  # biased exponent: optimisers with large last steps leave zeros in numbers below 2^-9
+_FIRST = 1 << 12  # smallest IDs, enough for the salts of most models
+
+
+def salt_rows(gaussians: Gaussians, ids: Bytes, layout: Layout) -> Integers:
+    """Rows of the salts' Gaussians, at most SALTS, in the order of the salts; `ids` [N, 16]."""
+    numbers = ids[:, :8].copy().view(">u8")[:, 0].astype(np.uint64)
+    rows = np.argpartition(numbers, _FIRST)[:_FIRST] if len(ids) > _FIRST else np.arange(len(ids))
+    late = _lateness(gaussians[torch.from_numpy(rows)], layout)
+    if (late == 0).sum() < SALTS:  # of the smallest IDs too few
+        rows, late = np.arange(len(ids)), _lateness(gaussians, layout)
+    keys = late << np.uint64(56) | numbers[rows] >> np.uint64(8)
+    best = np.argpartition(keys, SALTS - 1)[:SALTS] if len(keys) > SALTS else np.arange(len(keys))
+    low = read_low_bits(gaussians[torch.from_numpy(rows[best])], LEAST, layout)
+    places = [
+        (late[each], ids[rows[each]].tobytes(), own.tobytes()) for each, own in zip(best, low, strict=True)
+    ]
+    return rows[best[sorted(range(len(best)), key=places.__getitem__)]]
+
+
+def _lateness(gaussians: Gaussians, layout: Layout) -> Words:
+    """[N] octaves by which the smallest even number lies below _LARGE_ENOUGH, 0 for larger ones.
+
+    255 for Gaussians that moved by equal steps away from zero.
+    """
+
+    def work(start: int, stop: int) -> Words:
+        used = used_words(gaussians[start:stop])[:, layout.columns]
+        below = np.where(
+            used & 1 == 0, _LARGE_ENOUGH - (used >> np.uint32(23) & np.uint32(255)).astype(np.int64), 0
+        )
+        smallness: Words = below.max(axis=1, initial=0).astype(np.uint64)
+        return smallness
+
+    small = np.concatenate([np.zeros(0, np.uint64), *in_blocks(work, len(gaussians), BLOCK)])
+    return np.where(moved_from_zero(gaussians, layout), np.uint64(255), small)
+
+
+def salt(carrier_id: Bytes, low: Bytes) -> bytes:
+    """The salt of one carrier: SALT_BYTES."""
+    return hashlib.sha256(_LABEL + carrier_id.tobytes() + low.tobytes()).digest()[:SALT_BYTES]
