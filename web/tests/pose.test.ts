@@ -44,9 +44,12 @@ test.each([[0.5], [1], [1.6]])('the first pose frames a model at aspect %f', (as
   }
 });
 
-test('a floor across z means z up, unless given', () => {
+test('a floor is below the model, unless up is given', () => {
+  const level = box([0, 0, 0], [1, 1, 1], 1);
+  expect(upName(firstPose(level, 1).up)).toBe('y');
+  level.means.forEach((value, at) => { level.means[at] = -value; });
+  expect(upName(firstPose(level, 1).up)).toBe('-y');
   expect(upName(firstPose(box([0, 0, 0], [1, 1, 1], 2), 1).up)).toBe('z');
-  expect(upName(firstPose(box([0, 0, 0], [1, 1, 1], 1), 1).up)).toBe('-y');
   for (const [name, up] of Object.entries(UPS)) expect(upName(firstPose(box([0, 0, 0], [1, 1, 1], 2), 1, up).up)).toBe(name);
 });
 

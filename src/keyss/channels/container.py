@@ -47,7 +47,7 @@ _FOREIGN = (
     "have chosen which secret the key opens: reveal it from the file as it was published"
 )
 _ASSOCIATED = b"keyss/v1/payload"  # authenticated with a payload
-_VERSION = 8
+_VERSION = 1
 _CHECK_BYTES = 8
 _PARAMETERS = struct.Struct("<BBIHH")
 PARAMETER_BYTES = _CHECK_BYTES + _PARAMETERS.size

@@ -136,7 +136,7 @@ def test_hostile_parameters_end_in_a_sentence(
         reader.extract(keys()[0])
 
 
-@pytest.mark.parametrize("version", [0, 5, 7, 255])
+@pytest.mark.parametrize("version", [0, 2, 255])
 def test_other_versions_end_in_a_sentence(
     cover: Gaussians, version: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -144,6 +144,7 @@ def test_other_versions_end_in_a_sentence(
         patch.setattr(container, "_VERSION", version)
         stego = embed_payloads(LOW_BITS.prepare(cover), [(keys(), Payload("carry", b"x"))])
     with pytest.raises(
-        InputError, match=f"of version {version}; this program reads version [0-9]+: (update|open)"
+        InputError,
+        match=f"of version {version}; this program reads version 1: {'update' if version else 'open'}",
     ):
         LowBitsReader.of(stego).extract(keys()[0])

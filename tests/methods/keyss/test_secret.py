@@ -70,8 +70,8 @@ def test_round_trip() -> None:
 
 
 def test_unknown_version() -> None:
-    with pytest.raises(InputError, match=r"version 1.*version 11: open it with the keyss that wrote it"):
-        _unpack(_with_header(version=1))
+    with pytest.raises(InputError, match=r"version 2.*version 1: update keyss"):
+        _unpack(_with_header(version=2))
 
 
 @pytest.mark.parametrize(

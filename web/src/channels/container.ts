@@ -25,7 +25,7 @@ export interface Reader {
 
 const ASSOCIATED = ascii('keyss/v1/payload');
 const METHOD_BYTES = 15;
-const VERSION = 8;
+const VERSION = 1;
 const CHECK_BYTES = 8;
 export const PARAMETER_BYTES = CHECK_BYTES + 10;
 

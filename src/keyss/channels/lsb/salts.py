@@ -21,7 +21,7 @@ from keyss.kernels.parallel import in_blocks
 from keyss.keys.derivation import SALT_BYTES
 
 SALTS = 12  # random pruning of a quarter removes all their Gaussians with p = 6e-8
-_LABEL = b"keyss/v3/salt"
+_LABEL = b"keyss/v1/salt"
 _LARGE_ENOUGH = 118  # biased exponent: optimisers with large last steps leave zeros in numbers below 2^-9
 _FIRST = 1 << 12  # smallest IDs, enough for the salts of most models
 

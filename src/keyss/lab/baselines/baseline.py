@@ -23,7 +23,7 @@ from keyss.methods.method import Capabilities, Context, Prepared, Source, Stego
 from keyss.methods.placed_scene import PlacedScene
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
-FORMAT, VERSION = "keyss-baseline", 2
+FORMAT, VERSION = "keyss-baseline", 1
 DAMAGED = "the companion file is damaged"
 
 

@@ -40,7 +40,7 @@ from keyss.methods.placed_scene import PlacedScene
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
 NAME = "keyss"
-FORMAT, VERSION = "keyss-secret", 11
+FORMAT, VERSION = "keyss-secret", 1
 ANCHORS = 64
 ANCHORS_NEEDED = 0.25  # minimum share found
 ANCHOR_TOLERANCE = 1e-6  # fraction of the model's size

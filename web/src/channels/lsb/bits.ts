@@ -113,7 +113,7 @@ export function atDepth(low: Uint8Array, fields: number, depth: number): Uint8Ar
 }
 
 const SALTS = 4; // tried
-const LABEL = ascii('keyss/v3/salt');
+const LABEL = ascii('keyss/v1/salt');
 const EQUAL = 3; // numbers that moved by equal amounts
 const LARGE_ENOUGH = 118; // biased exponent of 2^-9
 const LAST = 255;
