@@ -209,7 +209,7 @@ def _print_result(args: HideArguments, result: HideResult) -> None:
         files |= {
             LOOK: "cover before and after, secret and revealed: look here first; it shows the secret",
             COMPANIONS: "hand this over to whoever may see the secret: `keyss reveal --companion`",
-            "private": "keep this private, or delete it: measurements, configuration, fitted models",
+            "private": "keep this private, or delete it: measurements, configuration, models that were fitted",
         }
     print_files(args.out, files)
     if not method.capabilities.keys:
@@ -315,7 +315,8 @@ def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
     ]
     kind = make_dataclass("Arguments", changed, bases=(HideArguments,), frozen=True, kw_only=True)
 
-    command = FunctionType(hide.__code__, hide.__globals__, "hide")  # `hide` with other annotations
+    # tyro builds its parser from annotations, and these depend on --method: a copy of `hide` gets its own.
+    command = FunctionType(hide.__code__, hide.__globals__, "hide")
     command.__annotations__ = {"args": Annotated[kind, arg(name="")], "return": None}
     command.__doc__ = hide.__doc__
     return command

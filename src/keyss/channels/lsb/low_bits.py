@@ -28,8 +28,8 @@ from keyss.channels.lsb.bits import DEEPEST, LEAST, Layout, gaussian_ids, read_l
 from keyss.channels.lsb.low_bits_capacity import (
     DATA_KEY_BYTES,
     MAX_INDEPENDENT,
+    Allocation,
     LowBitsCapacity,
-    Plan,
     codewords_of,
     key_message,
     parameter_message,
@@ -180,7 +180,7 @@ class Writer:
         raise AssertionError
 
     def _headers(
-        self, attempt: int, plan: Plan, keys: Sequence[Sequence[DerivedKey]], free: Flags
+        self, attempt: int, plan: Allocation, keys: Sequence[Sequence[DerivedKey]], free: Flags
     ) -> tuple[list[Part], list[bytes]]:
         """The headers of all secrets, and their data keys; their places are not `free` [N] any more.
 

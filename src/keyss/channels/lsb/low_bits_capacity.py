@@ -65,7 +65,7 @@ class Share:
 
 
 @dataclass(frozen=True)
-class Plan:
+class Allocation:
     """The division of carriers between payloads."""
 
     depth: int
@@ -97,7 +97,7 @@ class LowBitsCapacity:
         width = self.layout.width(LEAST)
         return SALTS * key_message(b"", width).places + parameter_message(b"", width).places
 
-    def plan(self, sizes: Sequence[int]) -> Plan:
+    def plan(self, sizes: Sequence[int]) -> Allocation:
         """Shares for sealed payloads of `sizes` bytes.
 
         Raises UsageError, with the number of Gaussians that would suffice.
@@ -111,7 +111,7 @@ class LowBitsCapacity:
         own = [share.holding(size) for share, size in zip(chosen, sizes, strict=True) if share]
         if not own:
             raise UsageError(self.too_small(max(sizes), len(sizes)))
-        return Plan(max(share.depth for share in own), own, independent)
+        return Allocation(max(share.depth for share in own), own, independent)
 
     def payload_capacity(self, secrets: int) -> int:
         """Maximum bytes of each of `secrets` sealed payloads with equal shares; may be 0."""
