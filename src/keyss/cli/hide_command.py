@@ -209,7 +209,7 @@ def _print_result(args: HideArguments, result: HideResult) -> None:
         files |= {
             LOOK: "cover before and after, secret and revealed: look here first; it shows the secret",
             COMPANIONS: "hand this over to whoever may see the secret: `keyss reveal --companion`",
-            "private": "keep this private, or delete it: measurements, configuration, models that were fitted",
+            "private": "keep this private, or delete it: measurements, configuration, fitted models if any",
         }
     print_files(args.out, files)
     if not method.capabilities.keys:
