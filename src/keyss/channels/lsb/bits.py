@@ -131,8 +131,12 @@ def used_words(gaussians: Gaussians) -> Words32:
 
 def group_words(gaussians: Gaussians) -> Iterator[Words32]:
     """The columns [N, C] of `used_words` by group; views where possible."""
-    groups = gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:]
-    return map(bit_patterns, groups)
+    return map(bit_patterns, groups_of(gaussians))
+
+
+def groups_of(gaussians: Gaussians) -> tuple[torch.Tensor, ...]:
+    """The attributes [N, ...] of `used_words`."""
+    return gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:]
 
 
 @kernel
@@ -173,5 +177,9 @@ def _unpack(words: Any, columns: Any, depth: int, data: Any) -> None:
 
 def bit_patterns(values: torch.Tensor) -> Words32:
     """[N, C] bit patterns; a view for contiguous float32 tensors on the CPU."""
-    flat = values.detach().to("cpu", torch.float32).reshape(len(values), math.prod(values.shape[1:]))
-    return flat.numpy().view(np.uint32)
+    return words_of(values).reshape(len(values), math.prod(values.shape[1:]))
+
+
+def words_of(values: torch.Tensor) -> Words32:
+    """[N, ...] bit patterns; a view for float32 tensors on the CPU."""
+    return values.detach().to("cpu", torch.float32).numpy().view(np.uint32)

@@ -37,8 +37,9 @@ from keyss.channels.lsb.bits import (
     Layout,
     coarse_lengths,
     gaussian_ids,
-    group_words,
+    groups_of,
     used_words,
+    words_of,
 )
 from keyss.channels.lsb.equal_steps import Steps
 from keyss.channels.lsb.trailing_zeros import count_trailing_zeros, least_exponent
@@ -220,7 +221,7 @@ def _without_copies(gaussians: Gaussians, layout: Layout, ids: Bytes) -> Flags:
         shared += [slice(GEOMETRY + colour, GEOMETRY + 9, 3) for colour in range(3)]
     keys = np.empty((len(shared) + 1, len(gaussians)), np.uint64)
     keys[-1] = ids.view("<u8")[:, 0]
-    common = [frequent(words, _unlikely_copies(words.size)) for words in group_words(gaussians)]
+    common = [frequent(words, _unlikely_copies(words.size)) for words in map(words_of, groups_of(gaussians))]
     fine = np.empty(len(gaussians), bool)
 
     def judge(start: int, stop: int) -> None:
