@@ -180,6 +180,7 @@ def _of_pairs(one: Words32, other: Words32, gaussians: Integers) -> dict[str, St
     """Statistics of pairs of numbers [P, C]; `gaussians` [P]: index of a Gaussian of each row."""
     alike = np.bincount(gaussians, (one == other).sum(axis=1))
     trials = np.bincount(gaussians) * one.shape[1]
+    gaussians = np.repeat(gaussians, one.shape[1])
     one, other = one.ravel(), other.ravel()
     distance = ulps(one, other)
     same_high = (one >> _LOW) == (other >> _LOW)
@@ -193,17 +194,22 @@ def _of_pairs(one: Words32, other: Words32, gaussians: Integers) -> dict[str, St
         "equal low bits": excess(int(equal[same_high].sum()), int(same_high.sum()), 1 / size),
         "near misses": near_misses(distance, equal, _MOVED, _AROUND),
         "equal": portion(alike, trials),
-        "within a quarter of an octave": _within_quarters(one, other),
+        "within a quarter of an octave": _within_quarters(one, other, gaussians),
     }
 
 
-def _within_quarters(one: Words32, other: Words32) -> Statistic:
-    """Correlation of the next 8 bits if exponents and the two leading bits agree; 0 for random bits."""
+def _within_quarters(one: Words32, other: Words32, gaussians: Integers) -> Statistic:
+    """Correlation of the next 8 bits if exponents and the two leading bits agree; 0 for random bits.
+
+    Pairs of one of the `gaussians` [P] depend on each other, so its error comes from sums over them.
+    """
     both = (one >> _QUARTER == other >> _QUARTER) & (one > 0) & (other > 0)
     if both.sum() < _MANY:
         return NOTHING
-    covariance = np.cov(*((words[both] >> _LOW & 255).astype(np.float64) for words in (one, other)))
-    return normal(12 * float(covariance[0, 1]) / (1 << 16), float(both.sum()) ** -0.5)
+    a, b = ((words[both] >> _LOW & 255) / 256.0 for words in (one, other))
+    products = 12 * (a - a.mean()) * (b - b.mean())
+    error = float(np.square(np.bincount(gaussians[both], products)).sum()) ** 0.5 / len(products)
+    return normal(float(products.mean()), max(error, len(products) ** -0.5))
 
 
 def _pairs_within_gaussians(
