@@ -139,6 +139,14 @@ def test_killed_before_first_checkpoint(tmp_path: Path) -> None:
     assert read_manifest(tmp_path).running is None
 
 
+@pytest.mark.parametrize("resume", [False, True])
+def test_killed_before_the_manifest(tmp_path: Path, resume: bool) -> None:
+    (tmp_path / "private").mkdir()
+    (tmp_path / "private" / "lock").touch()
+    write_run(tmp_path, resume=resume)
+    assert read_files(tmp_path)["publish/model.ply"] == b"1"
+
+
 def test_lock(tmp_path: Path) -> None:
     write_run(tmp_path)
     with lock(tmp_path / "private" / "lock", tmp_path):

@@ -100,7 +100,7 @@ class RunFolder:
             with lock(self.path / _LOCK, self.path):  # raises OutputError if another process holds it
                 pass
         manifest = read_manifest(self.path)
-        in_use = set(manifest.files) - self.onto or (manifest == Manifest() and any(self.path.iterdir()))
+        in_use = set(manifest.files) - self.onto or (manifest == Manifest() and self._has_files())
         if (running := manifest.running) is not None:
             if resume:
                 self._check_same(running)
@@ -118,6 +118,13 @@ class RunFolder:
             raise OutputError(
                 f"{self.path} exists: choose another folder, or `overwrite=True` to replace what keyss wrote"
             )
+
+    def _has_files(self) -> bool:
+        """True if the folder has a file; a killed process may leave the lock and folders."""
+        paths = self.path.rglob("*")
+        return any(
+            path != self.path / _LOCK and not (path.is_dir() and not path.is_symlink()) for path in paths
+        )
 
     def _files_to_replace(self, manifest: Manifest) -> list[str]:
         """Names of the files that this stage replaces."""
