@@ -103,7 +103,7 @@ def spz(degree: int) -> Callable[[int], Files]:
     """As many Gaussians as the bytes may hold, all equal; the rest of the bytes are empty deflate blocks."""
 
     def make(size: int) -> Files:
-        count = max(1 << 17, size // (6 if degree == 0 else 11))
+        count = max(1 << 17, int(size / (6 if degree == 0 else 9.75)))
         body = bytes(count * (20 + 3 * ((degree + 1) ** 2 - 1)))
         packer = zlib.compressobj(6, zlib.DEFLATED, -15)
         header = struct.pack("<4sIIBBBB", b"NGSP", 3, count, degree, 12, 0, 0)
@@ -117,7 +117,7 @@ def spz(degree: int) -> Callable[[int], Files]:
 
 
 def spz4(size: int) -> Files:
-    count = max(1 << 17, size // 11)
+    count = max(1 << 17, int(size / 9.75))
     sizes = [count * each for each in (9, 1, 3, 3, 4, 45)]
     packed = [zstandard.ZstdCompressor().compress(bytes(size)) for size in sizes]
     pad = bytes(max(0, size - sum(map(len, packed))))

@@ -18,7 +18,7 @@ from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.files.ply_table import OPACITY_LOGIT_BOUND
 
 # A compressed file of more Gaussians than SMALL_COUNT must have at least MIN_BYTES for each. Published models
-# take 7 and more, with harmonics of degree 3 10 and more.
+# take 7 and more, those of degree 3 10 and more (appended ones, which have no harmonics).
 SMALL_COUNT, MIN_BYTES = 1 << 17, 6
 BLOCK = 1 << 14  # Gaussians converted at a time, a multiple of the chunks of compressed .ply
 _MORTON_BITS = 21  # per axis

@@ -91,7 +91,7 @@ class _Header(NamedTuple):
         if len(start) < _START.size or not start.startswith(NGSP):
             raise InputError("not a whole SPZ file: it ends inside the header, or does not begin with NGSP")
         header = _Header._make(_START.unpack_from(start))
-        check_count(header.gaussians, size, MIN_BYTES + check_sh_degree(header.sh_degree) / 3)
+        check_count(header.gaussians, size, MIN_BYTES + check_sh_degree(header.sh_degree) / 4)
         if header.fractional_bits > MAX_FRACTIONAL_BITS:
             raise InputError(
                 f"expected positions of at most {MAX_FRACTIONAL_BITS} fractional bits, "
