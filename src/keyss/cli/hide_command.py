@@ -204,7 +204,9 @@ def _print_result(args: HideArguments, result: HideResult) -> None:
     what = (
         ": the cover with the secret in it" if method.capabilities.keys or method.options().may_train else ""
     )
-    files = dict.fromkeys(STEGOS, _HOW_TO_PUBLISH[result.survives] + what)
+    published = [args.out / name for name in STEGOS if (args.out / name).exists()]
+    size = f", {sum(path.stat().st_size for path in published) / 1e6:,.1f} MB"
+    files = dict.fromkeys(STEGOS, _HOW_TO_PUBLISH[result.survives] + what + size)
     if result.metrics is not None:
         files |= {
             LOOK: "cover before and after, secret and revealed: look here first; it shows the secret",

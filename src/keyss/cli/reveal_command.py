@@ -84,7 +84,7 @@ def verify(
 ) -> None:
     """Check that a model is sound and, with a key, that its secret is complete.
 
-    Exit status: 0 sound and complete, 3 the key opens nothing, 4 not sound or not complete.
+    Exit status: 0 sound and as published, 3 the key opens nothing, 4 not sound, changed or not complete.
 
     example: keyss verify model.ply --key-file key.txt
     """

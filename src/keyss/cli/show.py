@@ -34,8 +34,8 @@ def view(
         Path | None,
         optional(
             "PAGE",
-            "Write the page instead of serving it: a name that ends in .html becomes one file that opens "
-            "from disk, any other name a folder for a web server.",
+            "Write the page instead of serving it: a name that ends in .html or .htm becomes one file that "
+            "opens from disk, any other name a folder for a web server.",
             aliases=["-o"],
         ),
     ] = None,

@@ -21,7 +21,7 @@ from keyss.fitting.config import FitConfig, preset_for
 # Per Gaussian of the cover and of a secret (encoding, error correction), and per key.
 _COVER_SECONDS, _KEY_SECONDS = 4e-6, 1.0
 _SECRET_SECONDS = 5e-6, 3e-5  # in a cover that does not grow, and in one that does: precision is searched
-_FALLBACK = 'cannot hide this undetectably: {}; falling back to `publish="converted"`, which inspection finds'
+_FALLBACK = 'cannot hide this unchanged: {}; falling back to `publish="converted"`, which inspection finds'
 T = TypeVar("T")
 
 if TYPE_CHECKING:  # the command line reads options without torch
@@ -130,7 +130,7 @@ class MethodOptions:
 
     fit: FitConfig = field(default_factory=FitConfig)  # plain models, and joint training
     # "unchanged": the published model must stay as it is; "converted": it may be converted. None: unchanged,
-    # but converted if the secrets cannot be hidden undetectably in the cover's format.
+    # but converted if the secrets do not fit into the cover unchanged.
     publish: Publish | None = None
     format: Format | None = None  # of an unchanged model; None: the cover's
     # Of a converted model: appended Gaussians hold any secret but are visible in the file; colours are less

@@ -68,7 +68,7 @@ def page_with(model: bytes, name: str, look: Look) -> bytes:
 def export_html(
     model: Path | str, out: Path | str, *, look: Look | None = None, overwrite: bool = False
 ) -> tuple[Path, ...]:
-    """Write the viewer with the published `model`: one file if `out` ends in .html, else a folder.
+    """Write the viewer with the published `model`: one file if `out` ends in .html or .htm, else a folder.
 
     The file opens from disk; a folder, for larger models, needs a web server, and has embed.js, an element
     for other sites. `look`: see `look_of_model`. A model in a format that the page does not read is
