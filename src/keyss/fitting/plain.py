@@ -98,6 +98,9 @@ def _target(view: View, size: tuple[int, int], device: torch.device) -> Target:
     return Target.of(image.to(device), mask)
 
 
+_NOTED = 0.99  # share of the Gaussians that stay, below which a fit says so
+
+
 def fit_scene(
     scene: Scene,
     config: FitConfig | None = None,
@@ -125,7 +128,10 @@ def fit_scene(
     fingerprint = {**inputs, "config": asdict(config)}
     train(run, title, fingerprint=fingerprint, checkpoint=checkpoint, resume=resume, reporter=reporter)
     fitted = run.gaussians().to("cpu")
-    return FitResult(without_faint(fitted, config.prune_opacity) if run.grows else fitted, config)
+    kept = without_faint(fitted, config.prune_opacity) if run.grows else fitted
+    if reporter is not None and len(kept) < _NOTED * len(fitted):
+        reporter.note(f"{title}: {len(fitted) - len(kept):,} Gaussians that became transparent are left out")
+    return FitResult(kept, config)
 
 
 def without_faint(model: Gaussians, min_opacity: float) -> Gaussians:

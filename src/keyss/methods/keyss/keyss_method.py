@@ -75,11 +75,13 @@ class KeyssMethod:
         _encoder(options)
         shape = replace(design.decoder, sh_degree=options.fit.sh_degree)
         probe = KeyssSecret(Decoder(shape), torch.zeros(shape.key_size), Similarity(), torch.rand(ANCHORS, 3))
+        size = len(probe.payload().data)
+        plan = replace(options.joint_plan(secrets), notes=(_COST,))
         try:
-            check_payload_fits(len(probe.payload().data), options.fit.max_gaussians, secrets, shape.sh_degree)
+            check_payload_fits(size, options.fit.max_gaussians, secrets, shape.sh_degree)
         except UsageError as error:
             warnings.warn(f"method keyss: {error}; {_APPENDED}", KeyssWarning, stacklevel=2)
-        plan = replace(options.joint_plan(secrets), notes=(_COST,))
+            plan = replace(plan, gaussians=plan.gaussians + APPENDED.appended_count([size] * secrets))
         return Prepared.of(options, len(sources), plan)
 
     def hide(self, sources: Sequence[Source], prepared: Prepared, context: Context) -> Stego:
