@@ -307,7 +307,7 @@ def _consistent_rows(numbers: Integers, rows: Bytes, k: int, n: int) -> Flags:
     values = _scale(rows, -products[numbers])
     powers, consistent = _LOGARITHMS[points], np.ones(len(rows), bool)
     times = np.arange(min(len(rows) - k, 2 * _MAX_ERRORS))[:, None]
-    for step in (1, 2):  # different sums over the columns: an error goes unnoticed in one of 2^32 cases
+    for step in (1, 2):  # different sums over the columns; both miss an error in one of 2^32 cases
         weights = step * np.arange(values.shape[1]) % _ORDER
         terms = _LOGARITHMS[np.bitwise_xor.reduce(_POWERS[values + weights], axis=1)]
         syndromes = np.bitwise_xor.reduce(_POWERS[terms + times * powers % _ORDER], axis=1)

@@ -307,7 +307,7 @@ def test_covers_whose_harmonics_follow_each_other_are_refused() -> None:
     model = in_equal_steps(2000, (1, 5))
     usable = ~Steps(model, Layout(3)).equal(8)
     assert usable.mean() > 0.9
-    with pytest.raises(UsageError, match=r"tell each other's low bits \(p = .*equal steps"):
+    with pytest.raises(UsageError, match=r"predict each other's low bits \(p = .*equal steps"):
         LOW_BITS.prepare(model)
     noise = np.random.default_rng(1).integers(0, 256, (usable.sum(), 53), np.uint8)
     LOW_BITS.prepare(write_low_bits(model, Layout.of(model), [(8, np.flatnonzero(usable), noise)]))

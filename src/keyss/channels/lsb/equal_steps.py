@@ -152,7 +152,7 @@ def _alike(sh: Words32) -> Integers:
         for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
             with np.errstate(over="ignore", invalid="ignore"):
                 one, other = (numbers[0] + sign * numbers[at] for at, sign in enumerate(signs, 1))
-            order = one.argsort()
+            order = one.argsort(kind="stable")  # the same on every processor
             found = np.empty((_ALIKE * len(order), 2), np.int64)
             pairs.append(order[found[: _meet(one[order], other[order], cells[order], found)]])
         return np.concatenate(pairs)

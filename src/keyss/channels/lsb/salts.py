@@ -1,9 +1,9 @@
 """Salts of Argon2id, in the low bits of Gaussians.
 
-A *salt* is a hash of one Gaussian and its low bits, which are new random bits for every file and
-carry nothing else: no two files of one cover share a salt. There are several salts because Gaussians may be
-removed. Their order does not change by embedding: Gaussians come late that moved by equal steps away from
-zero or have small even numbers, which are often not usable; else the smallest IDs come first.
+A *salt* is a hash of one Gaussian and its low bits, which are new random bits for every file and carry
+nothing else: no two files of one cover share a salt. There are several because Gaussians may be removed.
+Embedding keeps their order: by ID, but last are Gaussians that are often not usable, since they moved away
+from zero by equal steps or have small even numbers.
 """
 
 from __future__ import annotations

@@ -137,7 +137,7 @@ def _what_tells(gaussians: Gaussians, layout: Layout, usable: Flags, depth: int,
         )
     if (chance := steps.chance(depth, usable)) < _CHANCE:
         return (
-            f"numbers of this cover tell each other's low bits (p = {chance:.0e}), because they moved by "
+            f"numbers of this cover predict each other's low bits (p = {chance:.0e}), because they moved by "
             "equal steps, and new ones would be seen: it was hardly trained, or seen from one direction"
         )
     return ""

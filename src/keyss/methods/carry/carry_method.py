@@ -154,7 +154,7 @@ class CarryMethod:
 def _fine_tuning_steps(
     secrets: Sequence[Source], sizes: Sequence[SecretSize], counts: Sequence[int], options: CarryOptions
 ) -> list[int]:
-    """Steps of fine-tuning of each secret, of which `counts` Gaussians fit; 0: none."""
+    """Fine-tuning steps of each secret; 0: none. `counts`: Gaussians of each secret that fit."""
     fit = options.fit.iterations
     steps = []
     for secret, size, count in zip(secrets, sizes, counts, strict=True):

@@ -3,8 +3,8 @@
 Read `keyss_options` (the paper's symbols and values), `decoder` (equations 6 and 8, appendix B), `training`
 (section 3.4, losses 4, 5 and 7, their sum 11), then this file.
 
-A payload holds what the key opens, and a channel encrypts it with the key: the decoder (weights in half
-precision), the vector of the key, the similarity from the secret's frame to the cover's, and *anchors*:
+A payload, encrypted with the key by its channel, holds the decoder (weights in half precision), the vector of
+the key, the similarity from the secret's frame to the cover's, and *anchors*:
 positions of some Gaussians of the stego model, to detect a moved or rounded model. docs/byte-layout.md lists
 the bytes.
 """
