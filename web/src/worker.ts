@@ -1,7 +1,7 @@
 /** Reads models and tries keys in a thread of its own. Nothing is stored. */
 import DERIVE from 'source:./derive.ts';
 import type { Reader } from './channels/container.ts';
-import { preparedFor } from './channels/opening.ts';
+import { channelsOf } from './channels/opening.ts';
 import { InputError } from './core/errors.ts';
 import { buffersOf, type Gaussians, opacitiesAreBytes } from './core/gaussians.ts';
 import { readModel } from './files/models.ts';
@@ -41,7 +41,7 @@ async function load(bytes: Uint8Array, name: string | undefined, tell: Tell): Pr
   tell({ model, wasDecoded: !codes && opacitiesAreBytes(model) });
   stego = model;
   // After the answer, so that the picture comes first. Without enough memory no key opens anything.
-  prepared = new Promise((resolve) => setTimeout(resolve, 0)).then(() => preparedFor(read)(false)).catch(() => null);
+  prepared = new Promise((resolve) => setTimeout(resolve, 0)).then(() => channelsOf(read, false)).catch(() => null);
 }
 
 async function unlock(key: string, tell: Tell): Promise<void> {
@@ -64,7 +64,7 @@ self.onmessage = async ({ data, ports: [port] }: MessageEvent<Question>) => {
   try {
     if (data.model) {
       stego = data.model;
-      prepared = Promise.resolve(preparedFor(data.model)(true));
+      prepared = channelsOf(data.model, true);
     }
     if (data.bytes) await load(data.bytes, data.name, tell);
     else await unlock(data.key ?? '', tell);

@@ -59,7 +59,8 @@ export function selected(gaussians: Gaussians, rows: ArrayLike<number>): Gaussia
 
 /** The Gaussians for which `keep` is true, in their order. */
 export function where(gaussians: Gaussians, keep: (row: number) => boolean): Gaussians {
-  const rows = [...Array(gaussians.count).keys()].filter(keep);
+  const rows: number[] = [];
+  for (let row = 0; row < gaussians.count; row++) if (keep(row)) rows.push(row);
   return rows.length === gaussians.count ? gaussians : selected(gaussians, rows);
 }
 
