@@ -37,8 +37,11 @@ _DRAWS = 16
 _PARTS = np.array([[1 / 16], [1 / 8], [1 / 4]])  # of a cell
 _ZERO, _COLOURS, _NOTHING = -1, -2, -3  # what a Gaussian is compared with, instead of another one
 _KINDS = _GEOMETRY, _HARMONICS, _BETWEEN_COLOURS = 0, 1, 2
-_FIRST, _LANES = 16, 48  # numbers before the harmonics of degrees 1 to 3, and room for these
-_BLOCK = 16  # numbers to compare at once
+_FIRST, _LANES = (
+    16,
+    48,
+)  # place of the harmonics of degrees 1 to 3 among a Gaussian's numbers, and room for them
+_BLOCK = 16  # points that a sweep looks at at once
 _NAN, _EXPONENT, _MAGNITUDE = np.uint32(0x7FC00000), np.uint32(0x7F800000), np.uint32(0x7FFFFFFF)
 
 
@@ -61,8 +64,11 @@ class Steps:
                 rows = self.order[start:stop]
                 self.others[rows, 2:] = tree.of(means[rows])[1][:, 1:]
 
+            def drop(start: int, stop: int) -> None:
+                _drop_mutual(self.order[start:stop], self.others)
+
             in_blocks(search, len(means), _ROWS)
-            _drop_mutual(self.order, self.others)
+            in_blocks(drop, len(means), _ROWS, _drop_mutual)
         self.words = _words(gaussians, layout)
         self.distant = _distant_siblings(self.words[1])
 
@@ -73,7 +79,7 @@ class Steps:
         """
         rows, distant = self.order, self.distant
         if among is not None:
-            rows, distant = rows[among[rows]], distant[among[distant[:, 0]]]
+            rows, distant = rows[among[rows]], distant[:, among[distant[0]]]
         moved = np.zeros(len(self.order), bool)
 
         def mark(start: int, stop: int) -> None:
@@ -81,7 +87,7 @@ class Steps:
             _mark(own, self.others[own], *self.words, depth, moved)
 
         in_blocks(mark, len(rows), _ROWS, _mark)
-        _mark(distant[:, 0], distant[:, 1:].astype(np.int32), *self.words, depth, moved)
+        _mark(distant[0], distant[1, :, None].astype(np.int32), *self.words, depth, moved)
         return moved
 
     def chance(self, depth: int, usable: Flags) -> float:
@@ -136,7 +142,7 @@ def _words(gaussians: Gaussians, layout: Layout) -> tuple[Words32, Words32]:
 
 
 def _distant_siblings(sh: Words32) -> Integers:
-    """[P, 2] Gaussians in which the harmonics of degree 1 of a colour may have moved by equal amounts.
+    """[2, P] Gaussians in which the harmonics of degree 1 of a colour may have moved by equal amounts.
 
     For any signs of the steps, two sums or differences are equal, up to the precision of the bits that stay.
     """
@@ -153,14 +159,15 @@ def _distant_siblings(sh: Words32) -> Integers:
         keys = (keys ^ (keys >> 31 & 0x7FFFFFFF)).astype(np.int64) << 32 | np.arange(len(keys))
         keys.sort()
         order, pairs = keys & 0xFFFFFFFF, []
+        sums, cells = sums[order], cells[order]
         for other in others:
             found = np.empty((_PARTNERS * len(order), 2), np.int64)
-            count = _sweep(sums[order], np.pad(other[order], (0, _BLOCK)), cells[order], found)
-            pairs.append(order[found[:count]])
-        return np.concatenate(pairs)
+            count = _sweep(sums, np.pad(other[order], (0, _BLOCK)), cells, found)
+            pairs.append(order[found[:count].T])
+        return np.concatenate(pairs, axis=1)
 
     colours = in_blocks(search, 6 if sh.shape[1] > 3 else 0, 1, _sweep)
-    return np.concatenate([np.empty((0, 2), np.int64), *colours])
+    return np.concatenate([np.empty((2, 0), np.int64), *colours], axis=1)
 
 
 def _hits(words: Words32, depth: int) -> Integers:
@@ -228,12 +235,9 @@ def _read_other(geometry: Any, sh: Any, row: Any, x: Any, y: Any) -> None:
         return
     for at in range(_FIRST + _LANES):
         y[at] = np.uint32(0) if row == _ZERO else _NAN
-    if row == _COLOURS:
-        for at in range(np.uint64(_FIRST), np.uint64(_FIRST - 3 + sh.shape[1]), np.uint64(3)):
-            for colour in range(3):
-                y[at + np.uint64(colour)] = (
-                    x[at + np.uint64((colour + 1) % 3)] & _MAGNITUDE | x[at + np.uint64(colour)] & ~_MAGNITUDE
-                )
+    for at in range(_LANES if row == _COLOURS else 0):
+        following = _FIRST + at // 3 * 3 + (at + 1) % 3
+        y[_FIRST + at] = x[following] & _MAGNITUDE | x[_FIRST + at] & ~_MAGNITUDE
 
 
 @inline
@@ -258,17 +262,15 @@ def _agree(steps: Any, cells: Any, one: Any, other: Any) -> Any:
 
 
 @inline
-def _count_pairs(
-    steps: Any, cells: Any, first: Any, lanes: Any, lags: Any, groups: Any, count: Any
-) -> Any:
-    """At least the number of pairs that agree among `count` numbers of each group from lane `first` on.
+def _most_pairs(steps: Any, cells: Any, first: Any, lanes: Any, lags: Any, groups: Any, count: Any) -> Any:
+    """How many pairs of numbers agree in groups of `count`, from lane `first` on, at most.
 
-    On a ring, the numbers of a pair are at most `lags`, half of 2 lags + 1 numbers, apart.
+    Fast, because it compares all numbers of a ring with those 1 to `lags` further: half of their number.
     """
     pairs, start, stride = np.int32(0), np.uint64(first), np.uint64(groups)
     for at in range(start, start + np.uint64(lanes // 2)):
-        other = at + np.uint64(groups * count)
-        steps[other], cells[other] = steps[at], cells[at]
+        again = at + np.uint64(groups * count)
+        steps[again], cells[again] = steps[at], cells[at]
     for at in range(start, start + np.uint64(lanes)):
         for lag in range(lags):
             pairs += np.int32(_agree(steps, cells, at, at + np.uint64(lag + 1) * stride))
@@ -276,12 +278,15 @@ def _count_pairs(
 
 
 @inline
-def _lanes_of(group: Any, quats: Any, harmonics: Any) -> Any:
-    """First lane of a group, distance between its lanes, and end."""
-    if group < quats:
-        return group, quats, 4 * quats
-    first = _FIRST + group - quats
-    return first, 3, first + 3 * harmonics
+def _most_equal(steps: Any, cells: Any, first: Any, groups: Any, count: Any) -> Any:
+    """How many of the `count` numbers of a group agree with one of them, at most; see `_most_pairs`."""
+    most, end = 0, first + groups * count
+    for one in range(first, end):
+        equal = 0
+        for other in range(first + (one - first) % groups, end, groups):
+            equal += _agree(steps, cells, one, other)
+        most = max(most, equal)
+    return most
 
 
 @kernel
@@ -293,24 +298,21 @@ def _mark(rows: Any, others: Any, geometry: Any, sh: Any, depth: int, moved: Any
     for row in range(len(rows)):
         one = rows[row]
         _read(geometry, sh, one, x)
-        for each in range(others.shape[1]):
-            other = others[row, each]
-            if other == _NOTHING or moved[one] and (other < 0 or moved[other]):
+        for column in range(others.shape[1]):
+            other = others[row, column]
+            if other == _NOTHING or (moved[one] and (other < 0 or moved[other])):
                 continue
             _read_other(geometry, sh, other, x, y)
             _compare(x, y, depth, known, steps, cells)
-            pairs = _count_pairs(steps, cells, 0, 8, 2, quats, 4)
-            pairs += _count_pairs(steps, cells, _FIRST, _LANES, 7, 3, harmonics)
-            for group in range(quats + 3 if pairs >= _EQUAL - 1 else 0):
-                first, step, end = _lanes_of(group, quats, harmonics)
-                for at in range(first, end, step):
-                    equal = 0
-                    for another in range(first, end, step):
-                        equal += _agree(steps, cells, at, another)
-                    if equal >= _EQUAL:
-                        moved[one] = True
-                        if other >= 0:
-                            moved[other] = True
+            pairs = _most_pairs(steps, cells, 0, 8, 2, quats, 4)
+            pairs += _most_pairs(steps, cells, _FIRST, _LANES, 7, 3, harmonics)
+            if pairs < _EQUAL - 1:
+                continue
+            equal = _most_equal(steps, cells, 0, quats, 4)
+            if max(equal, _most_equal(steps, cells, _FIRST, 3, harmonics)) >= _EQUAL:
+                moved[one] = True
+                if other >= 0:
+                    moved[other] = True
 
 
 @kernel
@@ -320,29 +322,25 @@ def _list(rows: Any, others: Any, geometry: Any, sh: Any, depth: int, found: Any
     `found` [M, 7]: first number of both Gaussians, second number, the Gaussians (one for _COLOURS), kind.
     Lists at most M. Steps of up to two cells are small by chance.
     """
-    quats, harmonics, size = geometry.shape[1] // 4, sh.shape[1] // 3 - 1, _FIRST + _LANES
+    quats, size, count = geometry.shape[1] // 4, _FIRST + _LANES, 0
     x, y, known = np.full(size, _NAN), np.full(size, _NAN), np.empty((3, size), np.uint32)
-    steps, cells, count = np.empty(size, np.float32), np.empty(size, np.float32), 0
+    steps, cells = np.empty(size, np.float32), np.empty(size, np.float32)
     for row in range(len(rows)):
         one = rows[row]
         _read(geometry, sh, one, x)
         for other in others[row]:
-            if other == _NOTHING:
-                continue
             _read_other(geometry, sh, other, x, y)
             _compare(x, y, depth, known, steps, cells)
-            for group in range(quats + 3):
-                first, step, end = _lanes_of(group, quats, harmonics)
-                for at in range(first, end, step):
-                    for each in range(first, at, step):
-                        if _agree(steps, cells, at, each) and steps[at] > 2 * max(cells[at], cells[each]):
-                            if count == len(found):
-                                return count
-                            entry = found[count]
-                            entry[0], entry[1] = x[at], y[at]
-                            entry[2], entry[3] = x[each], y[each]
-                            entry[4], entry[5], entry[6] = one, max(one, other), _GEOMETRY
-                            if group >= quats:
-                                entry[6] = _HARMONICS if other >= 0 else _BETWEEN_COLOURS
-                            count += 1
+            for at in range(size):
+                first, groups = (0, quats) if at < _FIRST else (_FIRST, 3)
+                for each in range(first + (at - first) % groups, at, groups):
+                    if _agree(steps, cells, at, each) and steps[at] > 2 * max(cells[at], cells[each]):
+                        if count == len(found):
+                            return count
+                        entry = found[count]
+                        entry[0], entry[1], entry[2], entry[3] = x[at], y[at], x[each], y[each]
+                        entry[4], entry[5], entry[6] = one, max(one, other), _GEOMETRY
+                        if at >= _FIRST:
+                            entry[6] = _HARMONICS if other >= 0 else _BETWEEN_COLOURS
+                        count += 1
     return count
