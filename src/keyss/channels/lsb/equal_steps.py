@@ -154,6 +154,7 @@ def _distant_siblings(sh: Words32) -> Integers:
         with np.errstate(over="ignore", invalid="ignore"):
             sums = first + sign * second
             others = first + third, first - third
+        sums[np.isnan(sums)] = np.inf  # the sign of NaN depends on the processor
         # Sorted with their rows in the lower half: the same on all processors, and faster than `argsort`.
         keys = sums.view(np.int32)
         keys = (keys ^ (keys >> 31 & 0x7FFFFFFF)).astype(np.int64) << 32 | np.arange(len(keys))

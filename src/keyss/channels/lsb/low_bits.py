@@ -246,7 +246,7 @@ class LowBitsReader(SaltedReader):
         record, payload = container.unseal_shards(data_key, codewords, numbers, shards, EXACT_BYTES)
         return replace(
             payload,
-            shards=(np.count_nonzero(np.bincount(numbers)), codewords.shards),
+            shards=(int((np.bincount(numbers) > 0).sum()), codewords.shards),
             foreign=exact_foreign(record, data_key, self.ids),
         )
 

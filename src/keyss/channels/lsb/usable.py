@@ -20,6 +20,7 @@ docs/threat-model.md tells what each hides.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,22 +118,30 @@ def _what_tells(gaussians: Gaussians, layout: Layout, usable: Flags, depth: int,
             "would be seen"
         )
     groups = layout.groups(gaussians[torch.from_numpy(rows[:: max(1, len(rows) // _SAMPLE)])])
-    for name, words in groups.items():
-        if words.size and (chance := chance_of_bits(words, depth + 1)) < _CHANCE:
-            return (
-                f"the low bits of {name} in this cover are not random (p = {chance:.0e}), and new ones "
-                "would be seen: the cover was quantised, scaled or moved after its training"
+
+    def tests() -> Iterator[tuple[float, str, str]]:
+        for name, words in groups.items():
+            if words.size:
+                relation = f"the low bits of {name} in this cover are not random"
+                yield (
+                    chance_of_bits(words, depth + 1),
+                    relation,
+                    "quantised, scaled or moved after its training",
+                )
+        if depth == LEAST:
+            relation = "harmonics of this cover are multiples of one step"
+            yield (
+                chance_of_lattice(groups[HARMONICS]),
+                relation,
+                "multiplied, as by an edit of its brightness",
             )
-    if depth == LEAST and (chance := chance_of_lattice(groups[HARMONICS])) < _CHANCE:
-        return (
-            f"numbers of this cover are multiples of one step (p = {chance:.0e}), and new low bits would be "
-            "seen: its colours were multiplied after training, as an edit of their brightness does"
-        )
-    if (chance := steps.chance(depth, usable)) < _CHANCE:
-        return (
-            f"numbers of this cover predict each other's low bits (p = {chance:.0e}), because they moved by "
-            "equal steps, and new ones would be seen: it was hardly trained, or seen from one direction"
-        )
+        relation = "numbers of this cover predict each other's low bits"
+        cause = "hardly trained, or seen from one direction, so that they moved by equal steps"
+        yield steps.chance(depth, usable), relation, cause
+
+    for chance, relation, cause in tests():
+        if chance < _CHANCE:
+            return f"{relation} (p = {chance:.0e}), and new ones would be seen: the cover was {cause}"
     return ""
 
 

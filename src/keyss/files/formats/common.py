@@ -327,7 +327,8 @@ def morton_keys(positions: Floats | Doubles, within: Floats | Doubles) -> Words:
             (2, 0x1249249249249249),
         ):
             cells = (cells | (cells << np.uint64(shift))) & np.uint64(mask)
-        return np.bitwise_or.reduce(cells << np.arange(3, dtype=np.uint64), axis=1)
+        places: Words = np.bitwise_or.reduce(cells << np.arange(3, dtype=np.uint64), axis=1)
+        return places
 
     return np.concatenate([np.empty(0, np.uint64), *in_blocks(keys, len(positions), BLOCK)])
 
