@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from keyss.core.errors import InputError, UsageError
+from keyss.files.inputs import STANDARD
 
 if TYPE_CHECKING:
     from keyss.core import ViewOptions
@@ -117,10 +118,13 @@ def flag(name: str) -> str:
 
 
 def check_exists(*paths: Path | None) -> None:
-    """Raise InputError if an input does not exist; - is the standard input. Does not import torch."""
-    for path in paths:
-        if path is not None and str(path) != "-" and not os.path.lexists(path):
-            raise InputError(f"{path}: expected a file or folder, but there is no such file")
+    """Raise InputError if an input does not exist, UsageError if - is given twice. Does not import torch."""
+    names = [str(path) for path in paths if path is not None]
+    if names.count(STANDARD) > 1:
+        raise UsageError("- is given twice, and standard input holds one model or key: use files for others")
+    for name in names:
+        if name != STANDARD and not os.path.lexists(name):
+            raise InputError(f"{name} does not exist")
 
 
 def check_seed(seed: int) -> int:

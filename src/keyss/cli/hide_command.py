@@ -136,8 +136,8 @@ def hide(args: HideArguments) -> None:
     example: keyss hide --cover cover.ply --secret-file letter.pdf --key-file key.txt -o runs/letter
     """
     details = args.details
-    check_exists(args.cover, details.cover_model)
-    check_exists(*args.secret, *args.secret_file, *args.key_file, *details.secret_model)
+    secrets = (*args.secret, *args.secret_file, *details.secret_model)
+    check_exists(args.cover, details.cover_model, *secrets, *args.key_file)
     options = _method_options(args)
     if args.secret_file:
         if args.secret:

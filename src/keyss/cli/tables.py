@@ -139,7 +139,7 @@ def _lines_on_wrong_keys(metrics: HideMetrics, names: Sequence[str]) -> list[str
     chance = ", ".join(f"{psnr:.2f}" for psnr in metrics.chance_level)
     return [
         f"PSNR of {wrong.keys} wrong keys: on average {cover}; at most {highest}.",
-        f"Chance level: {chance}, the published model's PSNR to the secret: the limit for wrong keys.",
+        f"Chance level: {chance}, the published model's PSNR to the secret; `keyss audit` judges by it.",
     ]
 
 

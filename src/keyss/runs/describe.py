@@ -81,7 +81,7 @@ def info(path: str | Path, *, capacity: bool = False) -> RunInfo | InterruptedRu
     path = Path(path)
     try:
         if not (is_standard(path) or path.exists()):
-            raise InputError(f"{path}: no such file or folder")
+            raise InputError(f"{path} does not exist")
         if path.is_dir() and not _holds_a_model(path):
             return _folder_info(path, capacity)
         return _model_info(model_file(path), capacity)
