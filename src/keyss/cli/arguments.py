@@ -41,14 +41,13 @@ KeyFilesToCheck = Annotated[
     UseAppendAction[tuple[Path, ...]],
     optional("FILE", "Key file of a secret to check; repeat for more.", "KEYSS_KEY, else no key"),
 ]
-Preset = Annotated[
-    Literal["quick", "default", "full"],
-    arg(
-        # The parser breaks lines at any comma.
-        help="Training steps and maximum number of Gaussians of each model: quick 500 and 10k; default 1k "
-        "and 30k, on CUDA as full; full 30k and 500k, on CUDA 1M."
-    ),
-]
+# The parser breaks lines at any comma.
+PRESETS = (
+    "Training steps and maximum number of Gaussians of each model: quick 500 and 10k; default 1k and 30k, on "
+    "CUDA as full; full 30k and 500k, on CUDA 1M."
+)
+PresetName = Literal["quick", "default", "full"]
+Preset = Annotated[PresetName, arg(help=PRESETS)]
 Width = Annotated[int | None, optional("PIXELS", "Downscale wider photos to this width.")]
 Iterations = Annotated[
     int | None, optional("N", "Training steps of each model, and of fine-tuning.", "the preset's")

@@ -14,13 +14,14 @@ from tyro.conf import OmitArgPrefixes, UseAppendAction, arg
 
 from keyss.cli.arguments import (
     PHOTOS,
+    PRESETS,
     TRAINING,
     Device,
     KeyFiles,
     OutFolder,
     Overwrite,
     Photos,
-    Preset,
+    PresetName,
     Resume,
     Training,
     changed_flags,
@@ -113,7 +114,9 @@ class HideArguments:
     ] = None
     out: OutFolder
     method: str
-    preset: Preset = "default"
+    preset: Annotated[
+        PresetName, arg(help=f"{PRESETS} Method carry: 2.15 times the steps for secrets of photos.")
+    ] = "default"
     dry_run: Annotated[bool, switch("Print the plan and estimates of time, memory and disk.")] = False
     resume: Resume = False
     overwrite: Overwrite = False
@@ -171,8 +174,8 @@ def hide(args: HideArguments) -> None:
         dry_run=args.dry_run,
         reporter=progress.reporter(),
     )
-    steps = result.cost.steps if result.cost else result.metrics and result.metrics.iterations
-    if idle and not steps:
+    trained = any(result.cost.steps) if result.cost else result.metrics and result.metrics.iterations
+    if idle and not trained:
         print(
             f"keyss: warning: {idle} had no effect: the secrets fit as they are, and nothing is trained",
             file=sys.stderr,
@@ -207,6 +210,7 @@ def _print_result(args: HideArguments, result: HideResult) -> None:
     published = [args.out / name for name in STEGOS if (args.out / name).exists()]
     size = f", {sum(path.stat().st_size for path in published) / 1e6:,.1f} MB"
     files = dict.fromkeys(STEGOS, _HOW_TO_PUBLISH[result.survives] + what + size)
+    files["private"] = "lists what --overwrite may replace"
     if result.metrics is not None:
         files |= {
             LOOK: "cover before and after, secret and revealed: look here first; it shows the secret",

@@ -120,7 +120,8 @@ class RunFolder:
             raise OutputError(f"{self.path} holds {content}, and no interrupted run that could be resumed")
         elif in_use == {self.stage} and self.onto and not overwrite:
             raise OutputError(
-                f"{self.path} has a finished {self.stage} already: `overwrite=True` replaces it and nothing else"
+                f"{self.path} has a finished {self.stage} already: `overwrite=True` replaces it and nothing "
+                "else"
             )
         elif in_use and not overwrite:
             raise OutputError(
