@@ -162,7 +162,7 @@ def test_info(run: Path, folders: tuple[Path, Path]) -> None:
     assert info(run / "publish" / "model.ply").keys() == info(run / "private" / "cover.ply").keys()
     assert info(folders[0])["test_views"] == 2
     assert info(run)["metrics"]["gaussians"] == len(keyss.read_model(run / "publish" / "model.ply"))
-    with pytest.raises(InputError, match="no such"):
+    with pytest.raises(InputError, match="does not exist"):
         keyss.info(run / "nothing")
 
 

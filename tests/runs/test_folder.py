@@ -131,6 +131,15 @@ def test_resume(tmp_path: Path) -> None:
     assert read_files(tmp_path) == {"publish/model.ply": b"whole"}
 
 
+def test_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is refused before any work."""
+    asked: list[Path] = []
+    monkeypatch.setattr("os.access", lambda path, mode: bool(asked.append(path)))
+    with pytest.raises(OutputError, match="is not writable"):
+        RunFolder(tmp_path / "a" / "b", "render")
+    assert asked == [tmp_path.resolve()]
+
+
 def test_resume_without_a_checkpoint(tmp_path: Path) -> None:
     with pytest.warns(KeyssWarning, match="holds no checkpoint: starting anew"):
         RunFolder(tmp_path / "new", "hide", resume=True)

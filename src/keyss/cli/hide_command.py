@@ -210,8 +210,9 @@ def _print_result(args: HideArguments, result: HideResult) -> None:
     published = [args.out / name for name in STEGOS if (args.out / name).exists()]
     size = f", {sum(path.stat().st_size for path in published) / 1e6:,.1f} MB"
     files = dict.fromkeys(STEGOS, _HOW_TO_PUBLISH[result.survives] + what + size)
-    files["private"] = "lists what --overwrite may replace"
-    if result.metrics is not None:
+    if result.metrics is None:
+        files["private"] = "lists what --overwrite may replace"
+    else:
         files |= {
             LOOK: "cover before and after, secret and revealed: look here first; it shows the secret",
             COMPANIONS: "hand this over to whoever may see the secret: `keyss reveal --companion`",

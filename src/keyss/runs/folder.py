@@ -93,6 +93,10 @@ class RunFolder:
             self._check(overwrite, resume)
             for name in self._files_to_replace(read_manifest(self.path)) if overwrite else ():
                 check_not_an_input(self.path / name, inputs)
+        real = Path(os.path.realpath(self.path))
+        nearest = next(folder for folder in (real, *real.parents) if folder.exists())
+        if not os.access(nearest, os.W_OK):
+            raise OutputError(f"cannot write to {self.path}: {nearest} is not writable")
         if resume and not self._has_checkpoints():
             warnings.warn(f"{self.path} holds no checkpoint: starting anew", KeyssWarning, stacklevel=3)
         for name in writes:
