@@ -144,7 +144,7 @@ class Visit:
         assert np.abs(self.picture() - before).mean() < 0.01 * 255
         assert self.page.locator("#revealed").is_hidden()
         assert self.page.locator("#progress").is_hidden()
-        assert self.page.locator("[role=status]").inner_text() == "Key tried. Search stopped."
+        assert self.page.locator("[role=status]").inner_text() == "Search stopped: nothing found so far."
         assert self.page.locator("#problem").inner_text() == ""
         return work
 

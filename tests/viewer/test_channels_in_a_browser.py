@@ -75,6 +75,8 @@ def test_file_in_colours(tab: Visit, tmp_path: Path) -> None:
     seen = []
     for key in ("another key", KEYS[0]):
         seen.append(tab.try_key(key, thorough=True))
+        said = tab.page.locator("[role=status]").inner_text()
+        assert said.startswith("The key reveals a file." if key == KEYS[0] else "This key opens nothing")
         assert tab.page.locator("#save").is_visible() == (key == KEYS[0])
     assert seen[0] == seen[1]
     assert len(seen[0]) > 17

@@ -107,6 +107,49 @@ def test_timing_does_not_reveal_secret(tab: Visit, page_file: Path) -> None:
     assert tab.page.locator("#revealed").is_visible()
 
 
+def in_place_of_thorough_searches(tab: Visit, answer: str) -> None:
+    """Let the questions of thorough searches be answered by a script instead of a worker."""
+    tab.page.add_init_script(
+        "Worker.prototype.postMessage = (ask => function (question, moved) {"
+        f" if (question.model) {{ {answer} }} else ask.call(this, question, moved);"
+        "})(Worker.prototype.postMessage)"
+    )
+
+
+def test_no_key_waits_for_the_search_of_another(tab: Visit, page_file: Path) -> None:
+    in_place_of_thorough_searches(tab, "")  # they never end
+    tab.goto(page_file.as_uri())
+    for key in ("another key", *KEYS):
+        tab.page.fill("#key", key)
+        tab.page.press("#key", "Enter")
+        said = "The key reveals" if key in KEYS else "Nothing found yet. Searching"
+        tab.page.wait_for_function(f"() => document.getElementById('status').textContent.startsWith('{said}')")
+        searching = "silent" if key in KEYS else "thorough"
+        tab.page.wait_for_selector(f"main[data-searching={searching}]")
+        tab.page.evaluate("document.getElementById('status').textContent = ''")
+
+
+def test_wrong_keys_are_explained(tab: Visit, page_file: Path, tmp_path: Path) -> None:
+    in_place_of_thorough_searches(tab, "moved[0].postMessage({})")
+    tab.goto(page_file.as_uri())
+    write_model(tmp_path / "small.spz", bright_model(200, 1))
+    write_model(tmp_path / "decoded.ply", read_model(tmp_path / "small.spz"))
+    for file in (None, tmp_path / "small.spz", tmp_path / "decoded.ply"):
+        if file is not None:
+            tab.page.set_input_files("#file", file)
+            tab.page.wait_for_function(f"() => document.title.startsWith('{file.name}')")
+            tab.settle()
+        tab.page.fill("#key", "another key")
+        tab.page.press("#key", "Enter")
+        tab.page.wait_for_function("() => document.getElementById('status').textContent.startsWith('This key')")
+        said = tab.page.locator("[role=status]").inner_text()
+        elsewhere = "this page, which cannot read secrets in models that were once compressed"
+        assert ((elsewhere in said) == (file is not None and file.suffix == ".ply")), said
+        assert re.fullmatch(r"[^.]+\.", said)
+        if elsewhere not in said:
+            assert all(each in said for each in ("wrong", "no secret", "changed", "check the key"))
+
+
 def test_damaged_files(tab: Visit, page_file: Path, stego: Path, tmp_path: Path) -> None:
     def problem(data: bytes) -> str:
         """The message about a file."""
@@ -190,7 +233,7 @@ def test_keyboard(tab: Visit, page_file: Path) -> None:
     tab.page.wait_for_selector("#revealed:not([hidden])")
     tab.page.wait_for_selector("main[aria-busy=false]")
     message = tab.page.locator("[role=status]").inner_text()
-    assert message.startswith("Key tried. It reveals a model of 200 Gaussians.")
+    assert message == "The key reveals a model of 200 Gaussians."
     assert tab.page.evaluate("document.activeElement.id") == "key"  # ready for the next key
     tab.page.focus("#close")
     tab.page.keyboard.press("Enter")

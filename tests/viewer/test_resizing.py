@@ -62,10 +62,8 @@ def test_found_is_found(chromium: Any, page_file: Path) -> None:
             tab.page.tap(summary)
             assert tab.page.evaluate(share) < 0.4
         tab.try_key(KEY)
-        assert (
-            tab.page.locator("[role=status]").inner_text()
-            == "Key tried. It reveals a model of 200 Gaussians."
-        )
+        said = tab.page.locator("[role=status]").inner_text()
+        assert said == "The key reveals a model of 200 Gaussians."
         assert tab.page.locator("#progress").is_hidden()
         assert tab.page.locator("#stop").is_hidden()
         assert tab.page.evaluate(share) < 0.4

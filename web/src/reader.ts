@@ -1,6 +1,6 @@
 /** Entry point of the package `keyss-reader`: reveals without the page. Its types are in web/reader. */
 import type { Reveal } from '../reader/index.d.ts';
-import { preparedFor } from './channels/opening.ts';
+import { channelsOf } from './channels/opening.ts';
 import { InputError } from './core/errors.ts';
 import { readModel } from './files/models.ts';
 import { writePly } from './files/ply.ts';
@@ -13,9 +13,8 @@ export const reveal: Reveal = async (bytes, key, { name, decodeWebP, signal, onP
   keyBytes(key); // validates
   signal?.throwIfAborted();
   const stego = await readModel(bytes, name, decodeWebP);
-  const channels = preparedFor(stego);
   for (const [thorough, from, to] of [[false, 0, QUICK], [true, QUICK, 1]] as const) {
-    const reader = channels(thorough);
+    const reader = await channelsOf(stego, thorough);
     let done = 0;
     const derive: Derive = sequential(async (...asked) => {
       await new Promise((resolve) => setTimeout(resolve, 0)); // lets other events run, such as an abort

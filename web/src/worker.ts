@@ -1,24 +1,24 @@
-/** The page's worker: reads models and tries keys. Nothing is stored. */
+/** Reads models and tries keys in a thread of its own. Nothing is stored. */
 import DERIVE from 'source:./derive.ts';
 import type { Reader } from './channels/container.ts';
-import { preparedFor } from './channels/opening.ts';
+import { channelsOf } from './channels/opening.ts';
 import { InputError } from './core/errors.ts';
-import { buffersOf, type Gaussians } from './core/gaussians.ts';
+import { buffersOf, type Gaussians, opacitiesAreBytes } from './core/gaussians.ts';
 import { readModel } from './files/models.ts';
 import { fileOf, type HiddenFile, secretOf } from './hidden.ts';
-import { type Derive, deriveInWorker, roundRobin, sequential, startWorker } from './keys/keys.ts';
+import { deriveInWorker, roundRobin, sequential, startWorker } from './keys/keys.ts';
 
-/** A file to read, or a key to try on the last file. The answers go to the port that comes with it. */
+/** A file to read; a key to try on it; or a key and a model to search thoroughly. Answers go to the port that comes with it. */
 export interface Question {
   readonly bytes?: Uint8Array;
   readonly name?: string; // some formats have no magic bytes
   readonly key?: string;
-  readonly thorough?: boolean; // searches the slow channels
-  readonly stop?: boolean; // cancels the current search
+  readonly model?: Gaussians; // of SH degree 0, for the slow channels
 }
 
 export interface Answer {
   readonly model?: Gaussians;
+  readonly wasDecoded?: boolean; // a .ply decoded from a compressed file, in which only `keyss reveal` finds secrets
   readonly foreign?: number; // Gaussians added to or changed in the published file
   readonly file?: HiddenFile;
   readonly elsewhere?: boolean; // only `keyss reveal` opens the payload
@@ -31,28 +31,21 @@ type Tell = (answer: Answer, moved?: Transferable[]) => void;
 
 // Derivation dominates the time of an attempt, so several run in parallel, at 64 MiB each.
 const DERIVERS = Math.max(1, Math.min(4, navigator.hardwareConcurrency || 2));
-const derive = roundRobin(Array.from({ length: DERIVERS }, () => sequential(whileSearched(deriveInWorker(startWorker(DERIVE))))));
-let searched: string | null = null; // the current key
+const derive = roundRobin(Array.from({ length: DERIVERS }, () => sequential(deriveInWorker(startWorker(DERIVE)))));
 let stego: Gaussians | null = null;
-let prepared: Promise<((thorough: boolean) => Reader) | null> = Promise.resolve(null);
-
-/** Rejects derivations of cancelled searches. */
-function whileSearched(derive: Derive): Derive {
-  return async (key, salt) => (key === searched ? derive(key, salt) : Promise.reject(new Error('stopped')));
-}
+let prepared: Promise<Reader | null> = Promise.resolve(null);
 
 async function load(bytes: Uint8Array, name: string | undefined, tell: Tell): Promise<void> {
   const read = await readModel(bytes, name);
   const { codes, ...model } = read;
-  tell({ model });
+  tell({ model, wasDecoded: !codes && opacitiesAreBytes(model) });
   stego = model;
   // After the answer, so that the picture comes first. Without enough memory no key opens anything.
-  prepared = new Promise((resolve) => setTimeout(resolve, 0)).then(() => preparedFor(read)).catch(() => null);
+  prepared = new Promise((resolve) => setTimeout(resolve, 0)).then(() => channelsOf(read, false)).catch(() => null);
 }
 
-async function unlock(key: string, thorough: boolean, tell: Tell): Promise<void> {
-  const reader = (await prepared)?.(thorough);
-  searched = key;
+async function unlock(key: string, tell: Tell): Promise<void> {
+  const [reader, model] = [await prepared, stego];
   let done = 0;
   const payload = await reader?.open(key, async (own, salt) => {
     const found = await derive(own, salt);
@@ -60,18 +53,21 @@ async function unlock(key: string, thorough: boolean, tell: Tell): Promise<void>
     return found;
   });
   tell({ progress: 1 }); // before decoding, which only right keys reach
-  if (!payload || !stego) return tell({});
-  const [file, model, { foreign }] = [fileOf(payload), secretOf(payload, stego), payload];
-  if (model) tell({ model, foreign }, buffersOf(model));
+  if (!payload || !model) return tell({});
+  const [file, secret, { foreign }] = [fileOf(payload), secretOf(payload, model), payload];
+  if (secret) tell({ model: secret, foreign }, buffersOf(secret));
   else tell(file ? { file, foreign } : { elsewhere: true });
 }
 
 self.onmessage = async ({ data, ports: [port] }: MessageEvent<Question>) => {
   const tell: Tell = (answer, moved = []) => port.postMessage(answer, moved);
   try {
-    if (data.stop) searched = null;
-    else if (data.bytes) await load(data.bytes, data.name, tell);
-    else await unlock(data.key ?? '', data.thorough ?? false, tell);
+    if (data.model) {
+      stego = data.model;
+      prepared = channelsOf(data.model, true);
+    }
+    if (data.bytes) await load(data.bytes, data.name, tell);
+    else await unlock(data.key ?? '', tell);
   } catch (error) {
     const message = error instanceof InputError ? error.message : 'This file cannot be read.';
     // Errors of a key are indistinguishable from a wrong key.

@@ -1,6 +1,6 @@
 import { expect, test } from 'vitest';
 import type { Payload } from '../src/channels/container.ts';
-import { preparedFor } from '../src/channels/opening.ts';
+import { channelsOf } from '../src/channels/opening.ts';
 import type { ReadModel } from '../src/files/models.ts';
 import { secretOf } from '../src/hidden.ts';
 import { columns, digest, jsonVector, modelOf, type Revealed } from './vectors.ts';
@@ -10,10 +10,11 @@ const REVEALED = jsonVector<Revealed[]>('revealed.json').filter(({ file }) => !f
 
 /** In the first channel in which it opens something: to look into all of them would take ten times as long. */
 async function opened(stego: ReadModel, key: string): Promise<Payload | null> {
-  const channels = preparedFor(stego);
-  for (const reader of [...channels(false).readers, ...channels(true).readers]) {
-    const payload = await reader.open(key);
-    if (payload !== null) return payload;
+  for (const thorough of [false, true]) {
+    for (const reader of (await channelsOf(stego, thorough)).readers) {
+      const payload = await reader.open(key);
+      if (payload !== null) return payload;
+    }
   }
   return null;
 }

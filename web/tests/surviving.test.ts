@@ -4,7 +4,7 @@ import { fittedSimilarity } from '../src/channels/appended/pilots.ts';
 import { type Payload, type Reader, unpackPayload } from '../src/channels/container.ts';
 import { Fountain, NOISY } from '../src/channels/colours/fountain.ts';
 import { ColoursReader } from '../src/channels/colours/colours_reader.ts';
-import { Channels, preparedFor } from '../src/channels/opening.ts';
+import { Channels, channelsOf } from '../src/channels/opening.ts';
 import { COLUMNS, emptyGaussians, type Gaussians, opacity, selected, where, withDegree } from '../src/core/gaussians.ts';
 import { moved, movedPoint } from '../src/core/similarity.ts';
 import { mixed, multiplicities, sortingOrder } from '../src/core/words.ts';
@@ -173,8 +173,7 @@ test('wrong keys open nothing in colours, nor in models without them', async () 
 test('channels report their number of derivations', async () => {
   for (const [file, channels] of Object.entries({ 'appended.ply': 3, 'colours.spz': 2, 'carried.ply': 2 })) {
     const model = await modelOf(file);
-    const prepared = preparedFor(model);
-    const readers = [...prepared(false).readers, ...prepared(true).readers];
+    const readers = [...(await channelsOf(model, false)).readers, ...(await channelsOf(model, true)).readers];
     expect(readers.length).toBe(channels);
     let asked = 0;
     const channel = new Channels(readers, model);

@@ -9,7 +9,7 @@ export function openingForm(show) {
       await show(URL.createObjectURL(new Blob([found.ply])));
       status.value = `${found.gaussians} Gaussians`;
     } else {
-      status.value = error ?? 'Key tried.';
+      status.value = error ?? 'This key opens nothing here.';
     }
   };
   form.onsubmit = async (event) => {

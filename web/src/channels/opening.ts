@@ -14,16 +14,19 @@ import { ColoursReader } from './colours/colours_reader.ts';
 import { LsbReader } from './lsb/reading.ts';
 
 /** A model's channels, prepared for any number of keys: the quick ones, or the thorough search of colours. */
-export function preparedFor(model: ReadModel): (thorough: boolean) => Channels {
-  const quick = [LsbReader.of(model), AppendedReader.of(model)].filter((each) => each !== null);
-  let colours: Reader | null = null;
-  return (thorough) => new Channels(thorough ? [(colours ??= ColoursReader.of(model))] : quick, model);
+export async function channelsOf(model: ReadModel, thorough: boolean): Promise<Channels> {
+  const readers = thorough ? [ColoursReader.of(model)] : [await LsbReader.of(model), AppendedReader.of(model)];
+  return new Channels(readers.filter((each) => each !== null), model);
 }
 
 /** Several channels; the first that opens wins. */
 export class Channels implements Reader {
+  private readonly copies: number;
+
   /** `model`: of these channels, searched for copies. */
-  constructor(readonly readers: readonly Reader[], private readonly model: Gaussians) {}
+  constructor(readonly readers: readonly Reader[], model: Gaussians) {
+    this.copies = copies(model);
+  }
 
   get derivations(): number {
     return this.readers.reduce((sum, each) => sum + each.derivations, 0);
@@ -34,7 +37,7 @@ export class Channels implements Reader {
     for (const outcome of outcomes) {
       if (outcome.status === 'rejected') throw outcome.reason;
       const found = outcome.value;
-      if (found !== null) return { ...found, foreign: found.foreign || copies(this.model) || undefined };
+      if (found !== null) return { ...found, foreign: found.foreign || this.copies || undefined };
     }
     return null;
   }

@@ -43,7 +43,7 @@ export function withDegree(gaussians: Gaussians, shDegree: number): Gaussians {
   for (const column of FIXED) found[column].set(gaussians[column]);
   const [from, to] = [3 * coefficients(gaussians.shDegree), 3 * coefficients(shDegree)];
   for (let row = 0; row < gaussians.count; row++) {
-    found.sh.set(gaussians.sh.subarray(row * from, row * from + Math.min(from, to)), row * to);
+    for (let at = 0; at < Math.min(from, to); at++) found.sh[row * to + at] = gaussians.sh[row * from + at];
   }
   return found;
 }
@@ -59,12 +59,19 @@ export function selected(gaussians: Gaussians, rows: ArrayLike<number>): Gaussia
 
 /** The Gaussians for which `keep` is true, in their order. */
 export function where(gaussians: Gaussians, keep: (row: number) => boolean): Gaussians {
-  const rows = [...Array(gaussians.count).keys()].filter(keep);
+  const rows: number[] = [];
+  for (let row = 0; row < gaussians.count; row++) if (keep(row)) rows.push(row);
   return rows.length === gaussians.count ? gaussians : selected(gaussians, rows);
 }
 
 export function opacity(logit: number): number {
   return 1 / (1 + Math.exp(-logit));
+}
+
+/** Whether there are at most 256 different opacities, as in models decoded from other formats. */
+export function opacitiesAreBytes(gaussians: Gaussians): boolean {
+  const different = new Set<number>();
+  return gaussians.opacityLogits.every((logit) => different.add(logit).size <= 256);
 }
 
 /** The `count` most visible Gaussians by opacity and cross-section, in their order. */

@@ -4,6 +4,7 @@ import { InputError } from '../core/errors.ts';
 import { coefficients, COLUMNS, emptyGaussians, type Gaussians, where } from '../core/gaussians.ts';
 
 const MAX_HEADER_BYTES = 65536;
+const ROWS = 4096; // read at a time, so that they stay in the cache
 const OPACITY_LOGIT_BOUND = 16; // replaces infinity
 const LEAST_LOG_SCALE = -87.33654; // replaces minus infinity
 
@@ -70,14 +71,16 @@ function elementsOf(header: string): Omit<Element, 'start'>[] {
   return elements;
 }
 
-/** The values of a property; null if there is none. */
-export function column({ bytes, littleEndian }: PlyFile, element: Element, name: string): Float64Array | null {
-  const property = element.properties.find((each) => each.name === name);
+/** The values of a property in some rows, by default all; null if there is none. */
+export function column(
+  { bytes, littleEndian }: PlyFile, { count, properties, start, stride }: Element, name: string, first = 0, rows = count,
+): Float64Array | null {
+  const property = properties.find((each) => each.name === name);
   if (property === undefined) return null;
   const [view, { read }] = [viewOf(bytes), TYPES.get(property.type)!];
-  const values = new Float64Array(element.count);
-  for (let row = 0; row < element.count; row++) {
-    values[row] = view[read](element.start + row * element.stride + property.offset, littleEndian);
+  const values = new Float64Array(Math.min(rows, count - first));
+  for (let row = 0, at = start + first * stride + property.offset; row < values.length; row++, at += stride) {
+    values[row] = view[read](at, littleEndian);
   }
   return values;
 }
@@ -92,17 +95,18 @@ export function readPly(file: PlyFile): Gaussians {
   if (!plyColumns(shDegree).every(({ name }) => names.has(name))) throw noModel();
   if (vertex.count === 0) throw new InputError(`This file holds no Gaussians${CURE}`);
   const found = emptyGaussians(vertex.count, shDegree);
-  for (const { name, to, offset } of plyColumns(shDegree)) {
-    const values = column(file, vertex, name)!;
-    const width = found[to].length / found.count;
-    for (let row = 0; row < values.length; row++) found[to][row * width + offset] = values[row];
+  for (let first = 0; first < found.count; first += ROWS) {
+    for (const { name, to, offset } of plyColumns(shDegree)) {
+      const width = found[to].length / found.count;
+      column(file, vertex, name, first, ROWS)!.forEach((value, row) => (found[to][(first + row) * width + offset] = value));
+    }
   }
-  for (const [row, logit] of found.opacityLogits.entries()) {
+  found.opacityLogits.forEach((logit, row) => {
     if (Math.abs(logit) === Infinity) found.opacityLogits[row] = Math.sign(logit) * OPACITY_LOGIT_BOUND;
-  }
-  for (const [at, logScale] of found.logScales.entries()) {
+  });
+  found.logScales.forEach((logScale, at) => {
     if (logScale === -Infinity) found.logScales[at] = LEAST_LOG_SCALE;
-  }
+  });
   return withoutNonFinite(found);
 }
 
@@ -124,7 +128,7 @@ export function checkFinite(gaussians: Gaussians): Gaussians {
 }
 
 function isFinite(gaussians: Gaussians): boolean {
-  return COLUMNS.every((each) => gaussians[each].every(Number.isFinite));
+  return COLUMNS.every((each) => gaussians[each].every((value) => value - value === 0));
 }
 
 /** The properties of a .ply in the order written: the column that holds each, and its offset in a row. */

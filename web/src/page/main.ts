@@ -1,6 +1,6 @@
 /** The page: a published model, a field for a key, and what the key opens. */
 import WORKER from 'source:../worker.ts';
-import type { Gaussians } from '../core/gaussians.ts';
+import { buffersOf, type Gaussians, withDegree } from '../core/gaussians.ts';
 import { writePly } from '../files/ply.ts';
 import type { HiddenFile } from '../hidden.ts';
 import { startWorker } from '../keys/keys.ts';
@@ -15,17 +15,21 @@ const ADDRESS_AFTER = 400; // ms after the last movement
 const MAX_BYTES = 2 ** 31;
 const HAS_SCREEN_KEYBOARD = window.matchMedia('(pointer: coarse)'); // which covers the picture
 const NO_WEBGL = "Your browser doesn't support WebGL 2, which is needed to show the model.";
+const SEARCHING = 'Nothing found yet. Searching more thoroughly …';
+const STOPPED = 'Search stopped: nothing found so far.';
+const NOTHING = 'This key opens nothing: it may be wrong, this file may hold no secret, or the file was changed; '
+  + 'check the key and ask for the original file.';
+const ELSEWHERE = 'This key opens nothing on this page, which cannot read secrets in models that were once compressed, '
+  + 'like this one: try keyss reveal.';
 const INTERRUPTED = 'The browser interrupted graphics. The picture comes back by itself; if not, reload the page.';
 
-/** Passes questions to the worker that reads files and tries keys, one at a time. */
+/** Asks a worker, one question at a time. */
 class Opener {
-  private readonly worker = startWorker(WORKER);
+  private worker: Worker | null = null;
   private end = (_: Answer): void => undefined; // answers the pending question
 
   /** `onProgress` receives the progress of an attempt, 0 to 1, at the same times for every key. */
-  constructor(private readonly onProgress: (share: number) => void) {
-    this.worker.onerror = () => this.end({ error: 'This file cannot be read.' });
-  }
+  constructor(private readonly onProgress: (share: number) => void) {}
 
   /** The model in a file, or what a key opens. `transfer`: memory to hand over to the worker. */
   ask(question: Question, transfer: Transferable[] = []): Promise<Answer> {
@@ -39,13 +43,16 @@ class Opener {
         if (data.progress === undefined) this.end(data);
         else this.onProgress(data.progress);
       };
+      this.worker ??= startWorker(WORKER);
+      this.worker.onerror = () => this.end({ error: 'This file cannot be read.' });
       this.worker.postMessage(question, [port2, ...transfer]);
     });
   }
 
-  /** Cancels the pending question. */
+  /** Ends the worker at once, whatever it does; the next question starts another. */
   stop(): void {
-    this.worker.postMessage({ stop: true } satisfies Question);
+    this.worker?.terminate();
+    this.worker = null;
     this.end({ stopped: true });
   }
 }
@@ -53,11 +60,10 @@ class Opener {
 class Page {
   private name = 'model';
   private published: Gaussians | null = null;
+  private wasDecoded = false;
   private secret: Gaussians | null = null;
-  private readonly opener = new Opener((share) => {
-    if (share < 1) page.progress.value = share;
-    else this.showSearch('');
-  });
+  private readonly reader = new Opener((share) => this.showProgress(share));
+  private readonly searcher = new Opener((share) => this.showProgress(share)); // of the slow channels, which new keys interrupt
   private readonly controls: Controls;
   private pose: Pose = { eye: [0, 0, -1], target: [0, 0, 0], up: UPS['-y'] };
   private readonly homes = new WeakMap<Gaussians, Pose>(); // first poses
@@ -89,7 +95,7 @@ class Page {
     page.background.addEventListener('input', () => this.viewer?.setBackground(page.background.value));
     page.picture.addEventListener('webglcontextlost', () => this.say(INTERRUPTED));
     page.picture.addEventListener('webglcontextrestored', () => this.say(''));
-    page.stop.addEventListener('click', () => this.opener.stop());
+    page.stop.addEventListener('click', () => this.searcher.stop());
     page.home.addEventListener('click', () => this.controls.setPose(this.firstPose()));
     page.snapshot.addEventListener('click', () => void this.snapshot());
     page.download.addEventListener('click', () => {
@@ -127,10 +133,11 @@ class Page {
     const own = this.startWork();
     this.say('Reading …');
     page.problem.textContent = this.viewer ? '' : NO_WEBGL;
-    const { model, error } = await this.opener.ask({ bytes, name }, [bytes.buffer]);
+    const { model, wasDecoded, error } = await this.reader.ask({ bytes, name }, [bytes.buffer]);
     if (own !== this.work) return;
     if (model === undefined) return this.fail(error ?? 'This file cannot be read.');
     [this.name, this.published] = [(this.work === 1 && params.title) || (page.main.dataset.title ?? name), model];
+    this.wasDecoded = wasDecoded ?? false;
     this.hideSecret();
     page.open.disabled = page.key.disabled = false;
     page.facts.textContent = `${this.name}\n${count(model.count)} Gaussians, SH degree ${model.shDegree}`;
@@ -145,45 +152,62 @@ class Page {
   }
 
   /**
-   * Wrong keys change nothing, and the same line follows every key. The form is ready again after the quick search,
-   * before a secret is decoded and rendered; the thorough search follows for every key, silently if the quick one found
-   * something.
+   * Every key makes both searches, the thorough one silently if the quick one found something. The form is ready again after
+   * the quick search, before a secret is decoded and rendered.
    */
   private async unlock(): Promise<void> {
-    const key = page.key.value;
-    if (!key || this.published === null || page.open.disabled) return;
+    const [key, published] = [page.key.value, this.published];
+    if (!key || published === null || page.open.disabled) return;
     const own = this.startWork();
     if (HAS_SCREEN_KEYBOARD.matches) page.key.blur();
     this.controls.rotate(false);
     this.writeAddress(); // before the key opens anything
-    let said = 'Key tried.';
-    let found = false;
+    this.say('Trying the key …');
+    let said = '';
     for (const search of ['quick', 'thorough'] as const) {
-      this.showSearch(found ? 'silent' : search);
-      if (!found) this.say(search === 'quick' ? 'Trying the key …' : `${said} Searching more thoroughly …`);
-      if (!found) delete page.main.dataset.picture;
-      const { model, file, elsewhere, foreign, stopped } = await this.opener.ask({ key, thorough: search === 'thorough' });
+      this.showSearch(said ? 'silent' : search);
+      if (!said) delete page.main.dataset.picture;
+      const answer = await (search === 'quick' ? this.reader.ask({ key }) : this.searchThoroughly(key, published));
       if (own !== this.work) return;
       this.showSearch('');
       if (search === 'quick') notifyParent({ event: 'key-tried' });
-      if (file || model) notifyParent({ event: 'opened', kind: file ? 'file' : 'model' });
-      if (file) said += this.offer(file);
-      if (model) said += this.reveal(model);
-      if (elsewhere) said += ' It reveals a model that only keyss reveal opens.';
-      if (foreign) said += ` About ${count(foreign)} Gaussians of the file were added or changed: it may not be its secret.`;
-      if (found && !(file || model || elsewhere)) return;
-      found = Boolean(file || model || elsewhere);
-      this.say(stopped ? `${said} Search stopped.` : said);
+      else this.searcher.stop(); // frees its memory
+      const found = this.found(answer);
+      if (said && !found) return;
+      said += found;
+      this.say(said || (search === 'quick' ? SEARCHING : answer.stopped ? STOPPED : this.wasDecoded ? ELSEWHERE : NOTHING));
       await this.settle();
       if (own !== this.work) return;
     }
   }
 
-  /** Starts a load or an attempt, and cancels the current search. */
+  /** In a worker of its own, so that the next key need not wait. */
+  private searchThoroughly(key: string, published: Gaussians): Promise<Answer> {
+    const model = withDegree(published, 0);
+    return this.searcher.ask({ key, model }, buffersOf(model));
+  }
+
+  /** Shows what a key opened; returns sentences about it, empty for nothing. */
+  private found({ model, file, elsewhere, foreign }: Answer): string {
+    if (file || model) notifyParent({ event: 'opened', kind: file ? 'file' : 'model' });
+    const sentences = [
+      file && this.offer(file), model && this.reveal(model),
+      elsewhere && 'The key opens a model that only keyss reveal shows.',
+      foreign && `About ${count(foreign)} Gaussians of the file were added or changed: it may not be its secret.`,
+    ];
+    return sentences.filter(Boolean).join(' ');
+  }
+
+  /** Starts a load or an attempt, and ends the thorough search of the last one. */
   private startWork(): number {
-    this.opener.stop();
+    this.searcher.stop();
     this.showSearch('');
     return ++this.work;
+  }
+
+  private showProgress(share: number): void {
+    if (share < 1) page.progress.value = share;
+    else this.showSearch('');
   }
 
   private showSearch(search: 'quick' | 'thorough' | 'silent' | ''): void {
@@ -203,7 +227,7 @@ class Page {
     page.save.textContent = `Save ${name} (${count(file.bytes.length)} bytes)`;
     page.save.onclick = () => save(name, new Blob([file.bytes as BlobPart]));
     page.save.hidden = false;
-    return ' It reveals a file.';
+    return 'The key reveals a file.';
   }
 
   /** Shows the secret from where the last model was seen. */
@@ -212,7 +236,7 @@ class Page {
     const pose = this.sameView(this.pose, this.secret ?? this.published ?? model, model);
     this.showSecret(model, 0);
     this.controls.setPose(pose);
-    return ` It reveals a model of ${count(model.count)} Gaussians.`;
+    return `The key reveals a model of ${count(model.count)} Gaussians.`;
   }
 
   private closeSecret(): void {

@@ -12,6 +12,7 @@ const SLOW = 120; // ms per frame above which motion is drawn coarsely,
 const COARSE = 0.5; // at this share of the resolution,
 const COARSE_COUNT = 15_000; // with at most this many Gaussians, the most visible ones
 const LARGE = 100_000; // Gaussians; larger models are coarse at first, as all of them take seconds
+const ROWS = 4096; // copied at a time, so that they stay in the cache
 const POLL = 4; // ms
 const AT_REST = 250; // ms without a change until the fine picture
 type Side = 'left' | 'right';
@@ -50,7 +51,9 @@ export class Viewer {
     system.on('frame:ready', (_camera: unknown, _layer: unknown, ready: boolean) => (this.ready = ready));
     app.on('framerender', () => {
       this.drawing = app.renderNextFrame; // other frames draw nothing
-      if (this.drawing) this.resize();
+      if (!this.drawing) return;
+      this.wanted = false; // this frame shows all changes up to now
+      this.resize();
     });
     app.on('frameend', () => {
       if (this.drawing) return this.afterFrame();
@@ -138,8 +141,9 @@ export class Viewer {
   }
 
   /** Resolves when a fine picture of the current models and poses is drawn. */
-  settled(): Promise<void> {
-    return new Promise((resolve) => {
+  async settled(): Promise<void> {
+    if (!this.inFlight && !this.moving && this.ready) return;
+    await new Promise<void>((resolve) => {
       this.whenReady.push(resolve);
       this.draw();
     });
@@ -261,10 +265,13 @@ export class Viewer {
 function gsplatData(model: Gaussians): GSplatData {
   const { count } = model;
   const properties = plyColumns(model.shDegree).map(({ name, to, offset }) => {
-    const width = model[to].length / count;
-    const [values, storage] = [model[to], new Float32Array(count)];
-    for (let row = 0; row < count; row++) storage[row] = values[row * width + offset];
-    return { name, type: 'float', storage, byteSize: 4 };
+    return { name, type: 'float', storage: new Float32Array(count), byteSize: 4, values: model[to], offset };
   });
+  for (let first = 0; first < count; first += ROWS) {
+    for (const { storage, values, offset } of properties) {
+      const width = values.length / count;
+      for (let row = first; row < Math.min(first + ROWS, count); row++) storage[row] = values[row * width + offset];
+    }
+  }
   return new GSplatData([{ name: 'vertex', count, properties }] as never);
 }

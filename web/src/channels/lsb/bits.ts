@@ -2,8 +2,8 @@
  * The low mantissa bits of a model: where they are, IDs of Gaussians, hashes of all other bits, and the Gaussians that serve as
  * the salt of Argon2id. See docs/byte-layout.md, "Low bits" and "From a key to a data key".
  */
-import { blake2b } from '@noble/hashes/blake2.js';
 import { sha256 } from '@noble/hashes/sha2.js';
+import { createBLAKE2b } from 'hash-wasm';
 import { ascii, joined, quantile } from '../../core/bytes.ts';
 import { coefficients, type Gaussians } from '../../core/gaussians.ts';
 
@@ -15,6 +15,7 @@ const UNIT_TOLERANCE = 1e-4;
 const FIRST_QUAT = 3;
 const LOW = 0x1ff; // bits that some depth replaces, and bit 0
 const PERSONALISATION = ascii('keyss/identity\0\0');
+const STATE = 4; // bytes before the state of BLAKE2b in what hash-wasm saves
 
 /** Bit patterns of the fields that may be in use, and which are. */
 interface Fields {
@@ -63,7 +64,11 @@ function coarseLength(words: Uint32Array, at: number): number {
 }
 
 /** [N, 16] a public hash of all of a Gaussian that embedding leaves as it is. */
-export function gaussianIds(gaussians: Gaussians, fields: Fields): Uint8Array {
+export async function gaussianIds(gaussians: Gaussians, fields: Fields): Promise<Uint8Array> {
+  const hasher = await createBLAKE2b(8 * ID_BYTES);
+  const start = hasher.init().save();
+  // hash-wasm has no option for it: the last of the parameters with which the state begins, as of RFC 7693.
+  PERSONALISATION.forEach((byte, at) => (start[STATE + 48 + at] ^= byte));
   const { count, width, words, inUse } = fields;
   const found = new Uint8Array(count * ID_BYTES);
   const means = new Uint32Array(gaussians.means.buffer, gaussians.means.byteOffset, 3 * count);
@@ -73,8 +78,7 @@ export function gaussianIds(gaussians: Gaussians, fields: Fields): Uint8Array {
     row.set(means.subarray(3 * index, 3 * index + 3));
     row.set(words.subarray(index * width, (index + 1) * width), 3);
     for (const field of inUse) row[3 + field] &= ~LOW | 1;
-    const hash = blake2b(bytes, { dkLen: ID_BYTES, personalization: PERSONALISATION });
-    found.set(hash, index * ID_BYTES);
+    found.set(hasher.load(start).update(bytes).digest('binary'), index * ID_BYTES);
   }
   return found;
 }

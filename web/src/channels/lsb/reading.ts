@@ -31,7 +31,7 @@ export abstract class LsbReader implements Reader {
   protected constructor(private readonly salts: readonly Uint8Array[]) {}
 
   /** The reader of the quantised values of a file, else of low bits; null without capacity. */
-  static of(model: ReadModel): LsbReader | null {
+  static async of(model: ReadModel): Promise<LsbReader | null> {
     return model.codes ? BlockReader.ofCodes(levelsOf(model.codes)) : LowBitsReader.ofModel(model);
   }
 
@@ -66,9 +66,9 @@ class LowBitsReader extends LsbReader {
     super(salts);
   }
 
-  static ofModel(model: Gaussians): LowBitsReader {
+  static async ofModel(model: Gaussians): Promise<LowBitsReader> {
     let fields = fieldsOf(model);
-    let [ids, low] = [gaussianIds(model, fields), lowBits(fields)];
+    let [ids, low] = [await gaussianIds(model, fields), lowBits(fields)];
     const rows = uniqueRows(ids, low, fields.inUse.length);
     if (rows.length < model.count) {
       fields = fieldsOf(selected(model, rows));
