@@ -13,6 +13,7 @@ from cli.harness import COMMANDS, Result, Run, assert_refused
 from keyss import __version__
 from keyss.fitting import PRESETS as FIT_PRESETS
 from keyss.methods import registry
+from keyss.methods.carry.carry_options import FINE_TUNING
 
 
 def test_overview(keyss: Run) -> None:
@@ -53,6 +54,7 @@ def test_presets(keyss: Run) -> None:
         result = keyss("hide", "--method", name, "--help").out
         assert f"--preset {{{','.join(FIT_PRESETS)}}}" in result
         assert "(default: default)" in result
+        assert f"{1 + FINE_TUNING} times the steps" in " ".join(result.replace("│", " ").split())
 
 
 def test_hide_snapshot(keyss: Run) -> None:

@@ -38,6 +38,8 @@ def test_interrupted_run(keyss: Run, tmp_path: Path) -> None:
     assert re.search(r"kind +unfinished fit", result.out)
     assert re.search(r"interrupted after [78] training steps", result.out)
     assert "--resume continues it" in result.out
+    refused = keyss("evaluate", tmp_path / "run")
+    assert_refused(refused, 4, "found an interrupted one, which `keyss info")
 
 
 def test_photos_of_several_sizes(keyss: Run, tmp_path: Path) -> None:

@@ -143,8 +143,8 @@ def test_key_from_standard_input(keyss: Run, tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(f"{key}\n".encode())))
     stego = tmp_path / "run" / "publish" / "model.ply"
     assert keyss("reveal", stego, "--key-file", "-", "-o", tmp_path / "out.ply").status == 0
-    refused = keyss("verify", stego, "--key-file", "-", "--key-file", "-")
-    assert_refused(refused, 2, "reads one key from standard input")
+    for files in ((stego, "--key-file", "-", "--key-file", "-"), ("-", "--key-file", "-")):
+        assert_refused(keyss("verify", *files), 2, "- is given twice, and standard input holds one")
     twice = keyss("verify", stego, "--key-file", tmp_path / "key.txt", "--key-file", tmp_path / "key.txt")
     assert "secret of key 1" in twice.out
     assert "secret of key 2" in twice.out

@@ -26,6 +26,8 @@ def test_quiet(keyss: Run, scene: Path, flag: str) -> None:
     out = scene.parent / "out"
     assert quiet.out == f"{out / 'model.ply'}\n{out / 'private'}\n"
     assert str(out / "model.ply") in usual.out
+    assert "on test photos" in usual.out
+    assert "PSNR in dB" in usual.out
     assert progress.level == 0
 
 
@@ -39,6 +41,8 @@ def test_quiet_prints_paths_only(keyss: Run, tmp_path: Path) -> None:
     }
     for name, command in commands.items():
         assert keyss("-q", *command) == (0, f"{tmp_path / name}\n", "")
+    images = keyss("render", tmp_path / "a.ply", "-o", tmp_path / "images", "--width", 8).out
+    assert "60 images; private/ lists them for --overwrite" in images
 
 
 def test_quiet_keeps_errors(keyss: Run, tmp_path: Path) -> None:

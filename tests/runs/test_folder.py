@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from keyss.core import OutputError, UsageError
+from keyss.core import KeyssWarning, OutputError, UsageError
 from keyss.files import lock, write_bytes
 from keyss.runs import MANIFEST, Manifest, RunFolder, read_manifest, write_again
 
@@ -131,6 +131,22 @@ def test_resume(tmp_path: Path) -> None:
     assert read_files(tmp_path) == {"publish/model.ply": b"whole"}
 
 
+def test_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is refused before any work."""
+    asked: list[Path] = []
+    monkeypatch.setattr("os.access", lambda path, mode: bool(asked.append(path)))
+    with pytest.raises(OutputError, match="is not writable"):
+        RunFolder(tmp_path / "a" / "b", "render")
+    assert asked == [tmp_path.resolve()]
+
+
+def test_resume_without_a_checkpoint(tmp_path: Path) -> None:
+    with pytest.warns(KeyssWarning, match="holds no checkpoint: starting anew"):
+        RunFolder(tmp_path / "new", "hide", resume=True)
+    interrupt(tmp_path, {})
+    RunFolder(tmp_path, "hide", {}, resume=True)  # warnings are errors
+
+
 def test_killed_before_first_checkpoint(tmp_path: Path) -> None:
     interrupt(tmp_path, {"width": 1})
     (tmp_path / "private" / "checkpoint" / "fit").unlink()
@@ -139,6 +155,7 @@ def test_killed_before_first_checkpoint(tmp_path: Path) -> None:
     assert read_manifest(tmp_path).running is None
 
 
+@pytest.mark.filterwarnings("ignore:.*starting anew")
 @pytest.mark.parametrize("resume", [False, True])
 def test_killed_before_the_manifest(tmp_path: Path, resume: bool) -> None:
     (tmp_path / "private").mkdir()

@@ -7,8 +7,10 @@ from collections import namedtuple
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 
 import keyss
 from channels.lsb.trained_like import trained_like
@@ -16,6 +18,8 @@ from keyss import CarryOptions, FitConfig, Secret
 from keyss.core import OutputError
 from keyss.files import write_model
 from keyss.methods import registry
+from keyss.runs import planning
+from keyss.runs.folder import RunFolder
 from methods.keyss.small import small
 from tiny_scenes import tiny_scene
 
@@ -30,7 +34,7 @@ def test_sizes_and_steps(tmp_path: Path) -> None:
     options = small("published", FIT)
     found = keyss.hide(tiny_scene(0), secrets, method=options, out=tmp_path / "run", dry_run=True)
     plan, cost = found.plan, found.cost
-    assert cost.steps == 4 * 60  # three plain fits, and the joint training
+    assert cost.steps == (2 * 60,) * 3  # a plain fit of each scene, and the joint training
     assert len(cost.fit_seconds) == 3
     assert plan.gaussians > 2 * 400  # the payloads do not fit into low bits, and are appended
     assert plan.sh_degree == 3
@@ -72,7 +76,31 @@ def test_capacity(tmp_path: Path) -> None:
     assert plan.secret_gaussians == 6000
     # Fewer harmonics make room for more Gaussians than planned.
     assert 1000 < plan.capacity <= result.metrics.secret_gaussians[0] < 6000
-    assert found.cost.steps == 0
+    assert found.cost.steps == (0, 0)
+
+
+@pytest.mark.parametrize("fine_tune", ["auto", "always"])
+def test_disk_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fine_tune: Any) -> None:
+    """All files at the end of a run, when checkpoints and results exist."""
+    sizes: list[int] = []
+
+    def measured(folder: RunFolder) -> None:
+        files = [*folder.path.rglob("*.ply"), *folder.path.rglob("*.safetensors")]
+        sizes.append(sum(file.stat().st_size for file in files))
+        finish(folder)
+
+    finish = RunFolder._finish
+    monkeypatch.setattr(RunFolder, "_finish", measured)
+    monkeypatch.setattr(planning, "_OTHER_BYTES", 0)
+    fit = replace(FIT, iterations=5, max_gaussians=200)  # as many as start
+    options = CarryOptions(fit=fit, publish="converted", fine_tune=fine_tune)
+    hide = partial(keyss.hide, tiny_scene(0), [Secret(tiny_scene(1), KEY)], method=options, min_psnr=0)
+    cost = hide(out=tmp_path / "run", dry_run=True).cost
+    hide(out=tmp_path / "run")
+    keyss.fit(tiny_scene(0), config=fit, out=tmp_path / "fit")
+    assert sizes[0] <= cost.disk_bytes < 2 * sizes[0]
+    of_fit = planning.cost_of_fit(tiny_scene(0), fit, torch.device("cpu"))
+    assert sizes[1] <= of_fit.disk_bytes < 2 * sizes[1]
 
 
 def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,13 +108,13 @@ def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     def usage(path: Path) -> Usage:
         asked.append(Path(path))
-        return Usage(10**9, 10**9, 4 << 20)
+        return Usage(10**9, 10**9, 1 << 20)
 
     monkeypatch.setattr(shutil, "disk_usage", usage)
     write_model(tmp_path / "cover.ply", trained_like(2500))
     secrets = [Secret(trained_like(900, 1), KEY)]
     for verb in (keyss.hide, partial(keyss.hide, dry_run=True)):
-        with pytest.raises(OutputError, match=r"free space.*found 4 MB"):
+        with pytest.raises(OutputError, match=r"free space.*found 1 MB"):
             verb(tmp_path / "cover.ply", secrets, method="carry", out=tmp_path / "a" / "run")
     assert set(asked) == {tmp_path.resolve()}
     assert [path.name for path in tmp_path.iterdir()] == ["cover.ply"]

@@ -272,6 +272,7 @@ def _look(models: Sequence[Gaussians], sources: Sequence[Source], device: torch.
         [
             (
                 role_of(index, len(sources)),
+                "photo" if source.photos else "given model",
                 source.scene if source.photos else from_above(source.scene),
                 model.to(device),
             )

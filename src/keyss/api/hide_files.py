@@ -73,8 +73,8 @@ def _check_sizes(channel: Channel, cover: Gaussians, payloads: Sequence[Payload]
         size = sum(compressed_size(payload.data) for payload in payloads)
     if size > _MOST * typical:
         raise UsageError(
-            f"the {channel.place} of a cover of {len(cover):,} Gaussians hold far less than the {size:,} "
-            "bytes of the given files"
+            f"the {channel.place} of a cover of {len(cover):,} Gaussians hold about {typical:,} bytes, and "
+            f"the given files take {size:,}"
         )
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from keyss.core.errors import InputError, UsageError
+from keyss.files.inputs import STANDARD
 
 if TYPE_CHECKING:
     from keyss.core import ViewOptions
@@ -40,14 +41,13 @@ KeyFilesToCheck = Annotated[
     UseAppendAction[tuple[Path, ...]],
     optional("FILE", "Key file of a secret to check; repeat for more.", "KEYSS_KEY, else no key"),
 ]
-Preset = Annotated[
-    Literal["quick", "default", "full"],
-    arg(
-        # The parser breaks lines at any comma.
-        help="Training steps and maximum number of Gaussians of each model: quick 500 and 10k; default 1k "
-        "and 30k, on CUDA as full; full 30k and 500k, on CUDA 1M."
-    ),
-]
+# The parser breaks lines at any comma.
+PRESETS = (
+    "Training steps and maximum number of Gaussians of each model: quick 500 and 10k; default 1k and 30k, on "
+    "CUDA as full; full 30k and 500k, on CUDA 1M."
+)
+PresetName = Literal["quick", "default", "full"]
+Preset = Annotated[PresetName, arg(help=PRESETS)]
 Width = Annotated[int | None, optional("PIXELS", "Downscale wider photos to this width.")]
 Iterations = Annotated[
     int | None, optional("N", "Training steps of each model, and of fine-tuning.", "the preset's")
@@ -117,10 +117,13 @@ def flag(name: str) -> str:
 
 
 def check_exists(*paths: Path | None) -> None:
-    """Raise InputError if an input does not exist; - is the standard input. Does not import torch."""
-    for path in paths:
-        if path is not None and str(path) != "-" and not os.path.lexists(path):
-            raise InputError(f"{path}: expected a file or folder, but there is no such file")
+    """Raise InputError if an input does not exist, UsageError if - is given twice. Does not import torch."""
+    names = [str(path) for path in paths if path is not None]
+    if names.count(STANDARD) > 1:
+        raise UsageError("- is given twice, and standard input holds one model or key: use files for others")
+    for name in names:
+        if name != STANDARD and not os.path.lexists(name):
+            raise InputError(f"{name} does not exist")
 
 
 def check_seed(seed: int) -> int:

@@ -14,13 +14,14 @@ from tyro.conf import OmitArgPrefixes, UseAppendAction, arg
 
 from keyss.cli.arguments import (
     PHOTOS,
+    PRESETS,
     TRAINING,
     Device,
     KeyFiles,
     OutFolder,
     Overwrite,
     Photos,
-    Preset,
+    PresetName,
     Resume,
     Training,
     changed_flags,
@@ -113,7 +114,9 @@ class HideArguments:
     ] = None
     out: OutFolder
     method: str
-    preset: Preset = "default"
+    preset: Annotated[
+        PresetName, arg(help=f"{PRESETS} Method carry: 2.15 times the steps for secrets of photos.")
+    ] = "default"
     dry_run: Annotated[bool, switch("Print the plan and estimates of time, memory and disk.")] = False
     resume: Resume = False
     overwrite: Overwrite = False
@@ -136,8 +139,8 @@ def hide(args: HideArguments) -> None:
     example: keyss hide --cover cover.ply --secret-file letter.pdf --key-file key.txt -o runs/letter
     """
     details = args.details
-    check_exists(args.cover, details.cover_model)
-    check_exists(*args.secret, *args.secret_file, *args.key_file, *details.secret_model)
+    secrets = (*args.secret, *args.secret_file, *details.secret_model)
+    check_exists(args.cover, details.cover_model, *secrets, *args.key_file)
     options = _method_options(args)
     if args.secret_file:
         if args.secret:
@@ -171,8 +174,8 @@ def hide(args: HideArguments) -> None:
         dry_run=args.dry_run,
         reporter=progress.reporter(),
     )
-    steps = result.cost.steps if result.cost else result.metrics and result.metrics.iterations
-    if idle and not steps:
+    trained = any(result.cost.steps) if result.cost else result.metrics and result.metrics.iterations
+    if idle and not trained:
         print(
             f"keyss: warning: {idle} had no effect: the secrets fit as they are, and nothing is trained",
             file=sys.stderr,
@@ -207,7 +210,9 @@ def _print_result(args: HideArguments, result: HideResult) -> None:
     published = [args.out / name for name in STEGOS if (args.out / name).exists()]
     size = f", {sum(path.stat().st_size for path in published) / 1e6:,.1f} MB"
     files = dict.fromkeys(STEGOS, _HOW_TO_PUBLISH[result.survives] + what + size)
-    if result.metrics is not None:
+    if result.metrics is None:
+        files["private"] = "lists what --overwrite may replace"
+    else:
         files |= {
             LOOK: "cover before and after, secret and revealed: look here first; it shows the secret",
             COMPANIONS: "hand this over to whoever may see the secret: `keyss reveal --companion`",

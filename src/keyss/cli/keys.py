@@ -42,8 +42,6 @@ def keys(files: Sequence[Path], count: int, *, new: bool = False) -> list[str]:
 
 def given_keys(files: Sequence[Path]) -> list[str]:
     """The keys in `files`, else the one in the environment, else none: for commands with optional keys."""
-    if sum(map(is_standard, files)) > 1:
-        raise UsageError("--key-file - reads one key from standard input: give the others in files")
     if files or VARIABLE not in os.environ:
         return [key_of_file(path) for path in files]
     try:

@@ -42,9 +42,9 @@ def reveal(
 ) -> None:
     """Reveal the secret that a key opens.
 
-    example: keyss reveal runs/hidden/publish/model.ply --key-file key.txt -o secret.ply
+    example: keyss reveal runs/hidden/publish/model.ply --key-file key.txt -o revealed.ply
 
-    example: keyss reveal - --key-file key.txt -o - < model.ply > secret.ply
+    example: keyss reveal - --key-file key.txt -o - < model.ply > revealed.ply
     """
     check_exists(stego, companion, *key_file)
     import keyss

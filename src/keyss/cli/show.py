@@ -140,7 +140,8 @@ def render(
         images = keyss.render(
             model, cameras, split=split, views=photos.views(), device=device, out=out, overwrite=overwrite
         )
-    print_written(out, f"{len(images)} image{'' if len(images) == 1 else 's'}")
+    listed = "; private/ lists them for --overwrite" if out.is_dir() else ""
+    print_written(out, f"{len(images)} image{'' if len(images) == 1 else 's'}{listed}")
 
 
 def info(
@@ -150,7 +151,7 @@ def info(
     ],
     *,
     capacity: Annotated[
-        bool, switch("Also what the model can hide, in each format and channel; takes seconds.")
+        bool, switch("Also what each format and channel can hide: bytes, and about how many Gaussians.")
     ] = False,
     json_: Annotated[bool, switch("Print JSON.", name="json")] = False,
 ) -> None:
@@ -188,7 +189,7 @@ def evaluate(
 
     example: keyss evaluate runs/hidden --key-file key.txt
     """
-    check_exists(run)
+    check_exists(run, *key_file)
     from keyss import progress
     from keyss.cli.tables import print_files, print_hiding
 

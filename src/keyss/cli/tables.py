@@ -62,9 +62,8 @@ def print_hiding(metrics: HideMetrics, *, brief: bool = False) -> None:
         first = [name + " (renders)" * (not shown) for name, shown in zip(names, metrics.photos, strict=True)]
     table = [[name, *(row.get(head, "") for head in heads)] for name, row in zip(first, rows, strict=True)]
     print_table([views, *heads], table)
-    legend = "; ".join(text for head in heads if (text := _HEADS[head]))
     wrong_keys = [] if brief else _lines_on_wrong_keys(metrics, names)
-    lines = [f"{legend}.", *wrong_keys, *_lines_on_files(metrics, names)]
+    lines = [_legend(heads), *wrong_keys, *_lines_on_files(metrics, names)]
     if not brief:
         units = {"capacity": "Gaussians", "capacity_bytes": "bytes"}
         capacities = {unit: metrics.details[name] for name, unit in units.items() if name in metrics.details}
@@ -99,6 +98,10 @@ def _scene_rows(metrics: HideMetrics) -> list[dict[str, str]]:
     return rows
 
 
+def _legend(heads: Iterable[str]) -> str:
+    return "; ".join(text for head in heads if (text := _HEADS.get(head))) + "."
+
+
 def _quality(of: ImageQuality) -> dict[str, str]:
     """Cells by the heads of their columns."""
     lpips = {} if of.lpips is None else {"LPIPS": f"{of.lpips:.3f}"}
@@ -107,7 +110,8 @@ def _quality(of: ImageQuality) -> dict[str, str]:
 
 def print_plan(method: str, plan: Plan, cost: Cost) -> None:
     """Print capacity and estimates of a run."""
-    steps = f", {cost.steps:,} training steps" if cost.steps else ""
+    of = [f"{role_of(index, len(cost.steps))} {steps:,}" for index, steps in enumerate(cost.steps)]
+    training = [("training", f"steps: {', '.join(of)}")] if any(cost.steps) else []
     rough = "about " if plan.capacity < plan.secret_gaussians else ""
     _print_columns(
         [
@@ -120,7 +124,8 @@ def print_plan(method: str, plan: Plan, cost: Cost) -> None:
                 "published",
                 f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, {plan.megabytes:,.1f} MB",
             ),
-            ("time", f"about {about(cost.seconds)} on {cost.where}{steps}"),
+            *training,
+            ("time", f"about {about(cost.seconds)} on {cost.where}"),
             ("memory", f"about {cost.memory_bytes / 1e9:.1f} GB"),
             ("disk", f"up to {cost.disk_bytes / 1e6:,.0f} MB at once, checkpoints included"),
             *(("note", note) for note in plan.notes),
@@ -139,7 +144,7 @@ def _lines_on_wrong_keys(metrics: HideMetrics, names: Sequence[str]) -> list[str
     chance = ", ".join(f"{psnr:.2f}" for psnr in metrics.chance_level)
     return [
         f"PSNR of {wrong.keys} wrong keys: on average {cover}; at most {highest}.",
-        f"Chance level: {chance}, the published model's PSNR to the secret: the limit for wrong keys.",
+        f"Chance level: {chance}, the published model's PSNR to the secret; `keyss audit` judges by it.",
     ]
 
 
@@ -165,9 +170,10 @@ def _lines_on_files(metrics: HideMetrics, names: Sequence[str]) -> list[str]:
 
 def print_fit(metrics: FitMetrics) -> None:
     """Print the numbers of a plain fit."""
-    quality = _quality(metrics)
-    sizes = (f"{metrics.gaussians:,}", f"{metrics.iterations:,}", f"{metrics.seconds:.0f}")
-    print_table((*quality, "Gaussians", "iterations", "seconds"), [(*quality.values(), *sizes)], texts=0)
+    row = _quality(metrics) | {"Gaussians": f"{metrics.gaussians:,}", "steps": f"{metrics.iterations:,}"}
+    row["seconds"] = f"{metrics.seconds:.0f}"
+    print_table(["on test photos", *row], [["plain model", *row.values()]])
+    print(_legend(row))
 
 
 def print_info(described: RunInfo | InterruptedRun | ModelInfo | SceneInfo) -> None:

@@ -60,7 +60,7 @@ def audit(
 
     example: keyss audit runs/hidden --key-file key.txt --only stealth --only leaks
     """
-    check_exists(run)
+    check_exists(run, *key_file)
     measure = verb("audit")
     from keyss import progress
     from keyss.cli.keys import keys_of_run
@@ -93,8 +93,10 @@ def audit(
         reporter=progress.reporter(),
     )
     if progress.level >= 0:
-        rows = [astuple(verdict) for verdict in result.verdicts]
-        print_table(("measure", "measured", "baseline or control", "limit", "verdict"), rows, texts=5)
+        for table in result.unjudged:
+            print_table(table.heads, table.rows)
+        if rows := [astuple(verdict) for verdict in result.verdicts]:
+            print_table(("measure", "measured", "baseline or control", "limit", "verdict"), rows, texts=5)
         Console().print(headline(result.verdicts), highlight=False)
     print_files(
         run,
@@ -216,6 +218,7 @@ def reproduce(
 
     example: keyss reproduce multi 360/* --full -o runs/paper-full
     """
+    check_exists(*scenes)
     run = verb("reproduce")
     from keyss import progress
     from keyss.cli.tables import print_files, print_table
@@ -275,6 +278,7 @@ def sweep(
 
     example: keyss sweep sweep.yaml -o runs/sweep --dry-run
     """
+    check_exists(spec)
     run = verb("sweep")
     from keyss import progress
     from keyss.cli.tables import print_files

@@ -30,14 +30,14 @@ def renders_of(model: Gaussians, cameras: Sequence[Camera], background: Tensor) 
     return renders
 
 
-def sheet_of(columns: Sequence[tuple[str, Scene, Gaussians]], views: int = 3) -> bytes:
-    """A PNG of test views: for each column's name, scene and model, the scene's image beside the render."""
+def sheet_of(columns: Sequence[tuple[str, str, Scene, Gaussians]], views: int = 3) -> bytes:
+    """A PNG of test views: for each role, kind of the scene's images, scene and model, image and render."""
     heads: list[str] = []
     pictures: list[list[Bytes]] = []
-    for name, scene, model in columns:
+    for role, kind, scene, model in columns:
         shown = subsample_views(scene.test, views)
         renders = renders_of(model, [view.camera for view in shown], scene.background)
-        heads += [name, f"{name}, {'published' if not heads else 'revealed'}"]
+        heads += [f"{role}, {kind}", f"{role}, {'published' if not heads else 'revealed'}"]
         pictures += [[view.image.numpy() for view in shown], [image.numpy() for _, image in renders]]
     count = min(map(len, pictures))
     rows = {f"view {row + 1}": [column[row] for column in pictures] for row in range(count)}

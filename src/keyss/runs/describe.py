@@ -17,7 +17,8 @@ from keyss.files.file_kinds import identify_file, is_training, is_unpacked_sog, 
 from keyss.files.inputs import is_standard
 from keyss.files.ply_summary import NEARLY_TRANSPARENT, summarise_ply
 
-_BYTES_PER_GAUSSIAN = {3: 19, 0: 12}  # of a hidden model, by SH degree, at the usual precision
+# Of a hidden model, by SH degree: `usual_size` of six models is 14 to 17, and 10 to 12.
+_BYTES_PER_GAUSSIAN = {3: 17, 0: 11}
 
 if TYPE_CHECKING:
     from keyss.core.gaussians import Gaussians
@@ -81,7 +82,7 @@ def info(path: str | Path, *, capacity: bool = False) -> RunInfo | InterruptedRu
     path = Path(path)
     try:
         if not (is_standard(path) or path.exists()):
-            raise InputError(f"{path}: no such file or folder")
+            raise InputError(f"{path} does not exist")
         if path.is_dir() and not _holds_a_model(path):
             return _folder_info(path, capacity)
         return _model_info(model_file(path), capacity)

@@ -14,7 +14,7 @@ from keyss.files.file_kinds import identify_file
 from keyss.files.model_formats import DECODED_SUFFIX, known_suffixes
 from keyss.files.models import is_model_source, read_model
 from keyss.methods.companion import SUFFIX
-from keyss.runs.folder import PRIVATE, PUBLISH
+from keyss.runs.folder import CHECKPOINTS, PRIVATE, PUBLISH
 
 STEGO = f"{PUBLISH}/model.ply"  # an innocuous name
 STEGOS = (STEGO, *(f"{PUBLISH}/model{suffix}" for suffix in (*SUFFIXES.values(), DECODED_SUFFIX)))
@@ -63,6 +63,8 @@ def run_folder(path: Path) -> Path:
     except OSError as error:
         run = next((parent for parent in path.absolute().parents[:2] if is_run(parent)), None)
         problem = f"{kind} in one; give {run}" if run else f"no {CONFIG} in it ({error.strerror})"
+        if os.path.isdir(path / CHECKPOINTS):
+            problem = f"an interrupted one, which `keyss info {path}` describes"
     raise InputError(
         f"{path}: expected the folder of a run, as `keyss hide --secret` writes it, found {problem}"
     )

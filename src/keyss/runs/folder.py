@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
+import warnings
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -19,7 +20,7 @@ from typing import Any
 import msgspec
 
 from keyss._version import __version__
-from keyss.core.errors import InputError, OutputError, UsageError
+from keyss.core.errors import InputError, KeyssWarning, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import check_not_an_input, lock, public_mode, write_bytes
 from keyss.files.models import write_model
@@ -60,7 +61,8 @@ class RunFolder:
     wrote such files. `inputs`: files that are read and must not be replaced.
 
     Nothing is created before `work`. Raises OutputError if the folder is not empty without `overwrite` or
-    `resume`, if there is nothing to resume, and if another process works in it; UsageError for both options.
+    `resume`, if it holds another run to resume, and if another process works in it; UsageError for both
+    options. Warns (KeyssWarning) if there is no checkpoint to resume from.
     """
 
     def __init__(
@@ -91,6 +93,12 @@ class RunFolder:
             self._check(overwrite, resume)
             for name in self._files_to_replace(read_manifest(self.path)) if overwrite else ():
                 check_not_an_input(self.path / name, inputs)
+        real = Path(os.path.realpath(self.path))
+        nearest = next(folder for folder in (real, *real.parents) if folder.exists())
+        if not os.access(nearest, os.W_OK):
+            raise OutputError(f"cannot write to {self.path}: {nearest} is not writable")
+        if resume and not self._has_checkpoints():
+            warnings.warn(f"{self.path} holds no checkpoint: starting anew", KeyssWarning, stacklevel=3)
         for name in writes:
             _refuse_foreign(self.path, name)
 
@@ -116,8 +124,8 @@ class RunFolder:
             raise OutputError(f"{self.path} holds {content}, and no interrupted run that could be resumed")
         elif in_use == {self.stage} and self.onto and not overwrite:
             raise OutputError(
-                f"{self.path} has a finished {self.stage} already: `overwrite=True` replaces all of its "
-                "parts and nothing else"
+                f"{self.path} has a finished {self.stage} already: `overwrite=True` replaces it and nothing "
+                "else"
             )
         elif in_use and not overwrite:
             raise OutputError(

@@ -24,18 +24,18 @@ from keyss.progress import about
 _STEP_SECONDS = {"cpu": 5e-7, "cuda": 6e-9}  # per training step, Gaussian and two pixels
 _VIEW_SECONDS = {"cpu": (1e-7, 8e-7), "cuda": (1e-8, 1e-8)}  # to measure a view, per Gaussian and pixel
 _READ_SECONDS = 1.5e-6  # per Gaussian: writing a model, and reading it again
-_CHECKPOINTS = 6  # two checkpoints / model: each holds parameters and two moments of Adam
+_CHECKPOINT = 3  # checkpoint / model: parameters and two moments of Adam
 _MAX_APPENDED = 7  # Gaussians that hold one Gaussian of a secret of SH degree 3
 _COPIES = 1  # of what is published and of the secrets in memory, beside the given models
 _SHARDS = 7  # copies of appended Gaussians: their shards, coded, placed and read again
-_OTHER_BYTES = 4 << 20  # JSON files, locks, and the overhead of the file system
+_OTHER_BYTES = 2 << 20  # pictures, JSON files, locks
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Estimates of a run: rough times, and upper limits of its disk space and memory."""
+    """Estimates of a run: rough times, disk space of files, and an upper limit of its memory."""
 
-    steps: int  # training steps
+    steps: tuple[int, ...]  # of training, for the cover, then the secrets
     seconds: float
     fit_seconds: tuple[float, ...]  # plain fits among them, the cover's first
     check_seconds: float  # reading the published file and measuring it
@@ -72,7 +72,7 @@ def cost_of(
 ) -> Cost:
     """The cost of a hiding."""
     fit = prepared.options.fit
-    steps, trained, sizes = max(training.steps for training in prepared.training), 0, []
+    steps, sizes, saved, written = [], [], [0], [prepared.plan.gaussians]  # saved: sizes of checkpoints
     seconds, check_seconds, fit_seconds, views = 0.0, 0.0, [], []
     for source, plain, training in zip(sources, prepared.fits, prepared.training, strict=True):
         known = source.given if training.continues else None
@@ -82,14 +82,21 @@ def cost_of(
         longer = Bound.of(training, plain_steps or None)
         if bound and source.photos and not longer.equal:
             renders += longer.steps or 0
+            saved.append(size)
+            written.append(size)
         step = step_seconds(device.type, size, _pixels(source.scene))
         seconds += renders * step
         views.append(view_seconds(device.type, size, source.scene))
         check_seconds += len(source.scene.test) * views[-1] + _READ_SECONDS * size
         fit_seconds.append(plain_steps * step)
-        steps += plain_steps
-        trained += size if plain_steps or training.steps else 0
+        steps.append(plain_steps + training.steps)
+        saved += [size] * (plain_steps > 0)
+        if training.steps and training.continues:
+            saved.append(min(size, prepared.plan.capacity))
+        written += [size] * source.photos
         sizes.append(size)
+    if any(training.steps and not training.continues for training in prepared.training):
+        saved.append(fit.max_gaussians)  # the joint training
     seconds += seconds_to_hide(sizes[0], sizes[1:], prepared.grows) + check_seconds
     appended = _MAX_APPENDED * sum(sizes[1:]) if prepared.grows else 0
     published = sizes[0] + appended
@@ -97,11 +104,14 @@ def cost_of(
     gaussian = 4 * (14 + 3 * (degree + 1) ** 2)  # bytes in a .ply, with normals
     resident: int = psutil.Process().memory_info().rss
     memory = resident + (_COPIES * (published + sum(sizes[1:])) + _SHARDS * appended) * gaussian
-    if trained:  # gradients, moments and two checkpoints
-        memory += (1 + _CHECKPOINTS) * max(published, *sizes) * gaussian
+    if any(saved):  # gradients, moments and two checkpoints
+        memory += (1 + 2 * _CHECKPOINT) * max(published, *sizes) * gaussian
         memory += max(Targets.max_bytes(source.scene.train) for source in sources)
-    disk = (published + sum(sizes) + _CHECKPOINTS * trained) * gaussian + _OTHER_BYTES
-    return Cost(steps, seconds, tuple(fit_seconds), check_seconds, sum(views), device.type, disk, memory)
+    # Checkpoints stay until the results are written; a new one is written before the old one is removed.
+    stored = _CHECKPOINT * sum(saved) + max(_CHECKPOINT * max(saved), sum(written))
+    disk = stored * gaussian + _OTHER_BYTES
+    times = seconds, tuple(fit_seconds), check_seconds, sum(views)
+    return Cost(tuple(steps), *times, device.type, disk, memory)
 
 
 def view_seconds(device: str, gaussians: int, scene: Scene) -> float:

@@ -92,6 +92,19 @@ def test_resume(run: Path, calls: list[str]) -> None:
     assert (run / "private" / "audit" / "pictures" / "speed-1.png").exists()
 
 
+def test_parts_are_added(run: Path, calls: list[str]) -> None:
+    audit(run, [KEY], controls=2, only=["speed"])
+    with pytest.raises(OutputError, match="`overwrite=True` replaces it"):
+        audit(run, [KEY], controls=2, only=["speed"])
+    audit(run, [KEY], controls=2, only=["leaks"])
+    found = audit(run, [KEY], controls=2, only=["leaks"], overwrite=True)
+    assert calls == ["speed", "leaks", "leaks"]
+    assert list(read_audit(run).sections) == list(found.sections) == ["speed", "leaks"]
+    assert (run / "private" / "audit" / "pictures" / "speed-1.png").exists()
+    with pytest.raises(OutputError, match="`overwrite=True` replaces it"):
+        audit(run, [KEY], controls=3, only=["leaks"])
+
+
 def test_invalid_arguments(run: Path, tmp_path: Path, calls: list[str]) -> None:
     with pytest.raises(WrongKeyError):
         audit(run, ["another"])

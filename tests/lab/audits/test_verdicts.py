@@ -114,12 +114,12 @@ def test_pruning() -> None:
 
 
 def test_the_headline() -> None:
-    assert headline([]) == "Nothing was measured that could be judged."
+    assert headline([]) == "No part that was measured has a limit."
     fine = Verdict("leaks", "0 dB", "", "", "fine")
-    assert headline([fine, fine]) == "All 2 measures are within their limits."
+    assert headline([fine, fine]) == "Within their limits: 2 of 2 measures."
     lines = [
         fine,
         replace(fine, measure="renders", word="visible"),
         replace(fine, measure="file", word="inconclusive"),
     ]
-    assert headline(lines) == "1 of 3 measures are within their limits. Visible: renders. Inconclusive: file."
+    assert headline(lines) == "Within their limits: 1 of 3 measures. Visible: renders. Inconclusive: file."

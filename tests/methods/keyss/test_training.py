@@ -98,12 +98,14 @@ def test_moved_model(hidden: Hidden) -> None:
             hidden.opened[0].reveal(other)
 
 
-def test_small_cover_warning() -> None:
-    inputs = [Source(model, photos=True) for model in three_scenes()[1]]
-    options = KeyssOptions(fit=FIT)
-    with pytest.warns(KeyssWarning, match=r"600 Gaussians is too small.*in appended Gaussians"):
-        registry.get("keyss").prepare(inputs[:2], options)
-    registry.get("keyss").prepare(inputs[:2], options.with_fit(max_gaussians=20_000))
+def test_note_on_a_small_cover() -> None:
+    inputs, options = [Source(model, photos=True) for model in three_scenes()[1]], KeyssOptions(fit=FIT)
+    notes, enough = (
+        "; ".join(registry.get("keyss").prepare(inputs[:2], each).plan.notes)
+        for each in (options, options.with_fit(max_gaussians=20_000))
+    )
+    assert "600 Gaussians is probably too small for low bits" in notes
+    assert "too small" not in enough
 
 
 def test_targets() -> None:

@@ -147,9 +147,9 @@ def _unpack_gzip(data: bytes) -> tuple[_Header, bytes, bytes]:
     except zlib.error as error:
         raise InputError(f"damaged SPZ: {reason(error)}") from error
     if len(body) < size or not stream.eof:
-        problem = "cut short" if len(body) < size or not stream.unconsumed_tail else "more than was announced"
+        found = "fewer" if len(body) < size or not stream.unconsumed_tail else "more"
         raise InputError(
-            f"not a whole SPZ: expected {size:,} bytes of {header.gaussians:,} Gaussians, found {problem}"
+            f"not a whole SPZ: expected {size:,} bytes of {header.gaussians:,} Gaussians, found {found}"
         )
     return header, body[:size], body[size:] if header.flags & EXTENSIONS else b""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from keyss.rendering import Backend, resolve_device
 from keyss.runs import read_record, write_record
 from keyss.runs.estimates import seconds_for
 from keyss.runs.files import REPORT, PathLike, as_scene, run_folder, stego_in
-from keyss.runs.folder import PRIVATE, RunFolder
+from keyss.runs.folder import PRIVATE, RunFolder, read_manifest
 from keyss.runs.open_run import open_run, read_run
 from keyss.runs.planning import cost_of_fit, view_seconds
 
@@ -56,8 +56,9 @@ def audit(
     compare with; at least 2, kept in `private/controls/`. `only`: names of parts, by default all.
 
     The folder gets `private/audit/` with pictures and `audit.json`, which is also returned, and
-    `private/report.md`. `resume` continues an interrupted audit after its finished parts. Raises KeyssError
-    (BackendError without the extra `audit`), and Interrupted on Ctrl-C.
+    `private/report.md`. Other parts of an earlier audit with the same controls stay. `resume` continues an
+    interrupted audit after its finished parts. Raises KeyssError (BackendError without the extra `audit`),
+    and Interrupted on Ctrl-C.
     """
     if controls < 2:
         raise UsageError(f"expected at least 2 plain models to compare with, got {controls}")
@@ -70,17 +71,19 @@ def audit(
         opened = open_run(run, keys)
     subject = Subject(opened, resolve_device(device))
     settings = {"controls": controls, "only": only, "seed": seed, "device": subject.device.type}
+    seeds = tuple(opened.config.options.fit.seed_of(f"control {seed + index}") for index in range(controls))
+    earlier = _earlier(opened.folder, seeds)
+    adds = not resume and earlier is not None and not earlier.sections.keys() & parts.keys()
     folder = RunFolder(
         opened.folder,
         "audit",
         settings | {"payloads": opened.config.payloads},
         onto=KEPT,
         writes=(AUDIT, REPORT),
-        overwrite=overwrite,
+        overwrite=overwrite or (adds and read_manifest(opened.folder).running is None),
         resume=resume,
     )
     with folder.work(), _resumable(folder.checkpoints):
-        seeds = [opened.config.options.fit.seed_of(f"control {seed + index}") for index in range(controls)]
         subject.fit_controls(seeds, folder, reporter)
         record, pictures = folder.checkpoints / "audit.json", folder.checkpoints / "pictures"
         cover, *secrets = opened.sources
@@ -90,8 +93,11 @@ def audit(
             secrets=tuple(secrets),
             width=opened.config.views.width,
             gaussians=len(opened.stego),
-            controls=tuple(seeds),
+            controls=seeds,
         )
+        if earlier:
+            kept = {name: part for name, part in earlier.sections.items() if name not in parts}
+            result = replace(result, seconds=earlier.seconds, sections=kept)
         if record.exists():
             result = read_record(record, Audit)
         for number, (name, part) in enumerate(parts.items(), start=1):
@@ -101,17 +107,29 @@ def audit(
             with reporter.waiting(f"audit, {number} of {len(parts)}: {name}", seconds) as share:
                 section, shown = part.measure(subject, seed, _in_shares(share))
             pictures.mkdir(exist_ok=True)
-            files = {caption: f"{name}-{index}.png" for index, caption in enumerate(shown, start=1)}
-            for caption, file in files.items():
+            names = {caption: f"{name}-{index}.png" for index, caption in enumerate(shown, start=1)}
+            for caption, file in names.items():
                 write_bytes(pictures / file, shown[caption])
-            section = replace(section, pictures=files)
+            section = replace(section, pictures=names)
             result = replace(result, sections=result.sections | {name: section})
             write_record(record, result)
-        result = replace(result, seconds=round(time.monotonic() - started, 1))
-        contents = {f"{PICTURES}/{path.name}": path.read_bytes() for path in pictures.glob("*.png")}
+        sections = {name: result.sections[name] for name in PARTS if name in result.sections}
+        seconds = round(result.seconds + time.monotonic() - started, 1)
+        result = replace(result, sections=sections, seconds=seconds)
+        folders = [opened.folder / PICTURES, pictures] if earlier else [pictures]
+        files = [path for each in folders for path in each.glob("*.png")]  # new ones last
+        contents = {f"{PICTURES}/{path.name}": path.read_bytes() for path in files}
         report = report_of(result, PICTURES.removeprefix(f"{PRIVATE}/"))
         folder.write({AUDIT: result, REPORT: report.encode(errors="replace"), **contents})
     return result
+
+
+def _earlier(run: Path, controls: tuple[int, ...]) -> Audit | None:
+    """The finished audit of a run with these controls, if there is one."""
+    with suppress(InputError):
+        found = read_audit(run)
+        return found if found.controls == controls else None
+    return None
 
 
 def _chosen(only: Sequence[str], method: str) -> dict[str, Part]:

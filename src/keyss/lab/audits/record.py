@@ -66,14 +66,18 @@ class Audit:
         """The verdicts of all sections."""
         return [verdict for section in self.sections.values() for verdict in section.verdicts]
 
+    @property
+    def unjudged(self) -> list[Table]:
+        """The tables of sections without verdicts."""
+        return [table for part in self.sections.values() if not part.verdicts for table in part.tables]
+
 
 def headline(verdicts: Sequence[Verdict]) -> str:
     """The verdicts in one or two sentences."""
     if not verdicts:
-        return "Nothing was measured that could be judged."
+        return "No part that was measured has a limit."
     fine = sum(verdict.word == "fine" for verdict in verdicts)
-    many = f"All {fine}" if fine == len(verdicts) else f"{fine} of {len(verdicts)}"
-    sentences = [f"{many} measures are within their limits."]
+    sentences = [f"Within their limits: {fine} of {len(verdicts)} measures."]
     for word in ("visible", "missed", "inconclusive"):
         if names := [verdict.measure for verdict in verdicts if verdict.word == word]:
             sentences.append(f"{word.capitalize()}: {', '.join(names)}.")

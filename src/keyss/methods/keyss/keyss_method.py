@@ -51,6 +51,7 @@ _COST = (
 )
 _IDLE = "density control added no Gaussian to the {:,} of the start: train longer, or allow more Gaussians"
 _APPENDED = "the secrets lie in appended Gaussians instead, which everybody can see in the file"
+_SMALL = "a model of {:,} Gaussians is probably too small for low bits; then {}"
 
 
 class KeyssMethod:
@@ -66,8 +67,7 @@ class KeyssMethod:
     ) -> Prepared:
         """All scenes share the Gaussians of one model, with the loss of the design.
 
-        Warns (KeyssWarning) if models are too small for the payloads' low bits. Raises BackendError if CLIP
-        is missing.
+        Raises BackendError if CLIP is missing.
         """
         design, secrets = options.configuration, len(sources) - 1
         if design.ssim_weight is not None:
@@ -79,16 +79,17 @@ class KeyssMethod:
         plan = replace(options.joint_plan(secrets), notes=(_COST,))
         try:
             check_payload_fits(size, options.fit.max_gaussians, secrets, shape.sh_degree)
-        except UsageError as error:
-            warnings.warn(f"method keyss: {error}; {_APPENDED}", KeyssWarning, stacklevel=2)
-            plan = replace(plan, gaussians=plan.gaussians + APPENDED.appended_count([size] * secrets))
+        except UsageError:
+            appended = APPENDED.appended_count([size] * secrets)
+            note = _SMALL.format(plan.gaussians, _APPENDED)
+            plan = replace(plan, gaussians=plan.gaussians + appended, notes=(_COST, note))
         return Prepared.of(options, len(sources), plan)
 
     def hide(self, sources: Sequence[Source], prepared: Prepared, context: Context) -> Stego:
         """Train the cover and the secrets jointly, and hide a payload for each secret.
 
-        Warns (KeyssWarning) if density control added nothing. Raises Interrupted on Ctrl-C, and InputError
-        for a checkpoint of another run.
+        Warns (KeyssWarning) if density control added nothing, and if the payloads exceed the low bits. Raises
+        Interrupted on Ctrl-C, and InputError for a checkpoint of another run.
         """
         options, keys = prepared.options, [source.key for source in sources[1:]]
         entropy = context.entropy or os.urandom(32)
