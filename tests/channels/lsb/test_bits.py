@@ -11,8 +11,8 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as arrays
 
 from keyss.channels import DEPTHS, Layout, gaussian_ids, read_low_bits, used_words, write_low_bits
-from keyss.channels.lsb.usable import repeated
 from keyss.core import Gaussians
+from keyss.core.arrays import repeated
 from keyss.kernels.parallel import in_blocks
 
 SHAPES = ((3,), (4,), (3,), ())

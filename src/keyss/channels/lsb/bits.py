@@ -15,7 +15,7 @@ index, so the order of Gaussians does not matter.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,8 +28,7 @@ from keyss.kernels.blake2b import blake2b_rows
 from keyss.kernels.jit import kernel
 from keyss.kernels.parallel import in_blocks
 
-GEOMETRY = 8  # fields before the harmonics: three log scales, four parts of a quaternion, opacity logit
-QUATS = slice(3, 7)
+ATTRIBUTES = SCALES, QUATS, OPACITIES, HARMONICS = "log scales", "quaternions", "opacity logits", "harmonics"
 DEPTHS = (4, 6, 8)  # bits of a field that are replaced
 LEAST, DEEPEST = DEPTHS[0], DEPTHS[-1]
 LOW = np.uint32((1 << DEEPEST + 1) - 1)  # mask of the bits that some depth replaces, and of bit 0
@@ -62,8 +61,13 @@ class Layout:
     @property
     def columns(self) -> Integers:
         """[F'] the columns of `used_words` in use."""
-        every = np.arange(GEOMETRY + 3 * ((self.sh_degree + 1) ** 2 - 1))
-        return every if self.quats else np.delete(every, QUATS)
+        every = np.arange(8 + 3 * ((self.sh_degree + 1) ** 2 - 1))
+        return every if self.quats else np.delete(every, slice(3, 7))
+
+    def groups(self, gaussians: Gaussians) -> dict[str, Words32]:
+        """[N, C] bit patterns in use by attribute; views where possible."""
+        every = dict(zip(ATTRIBUTES, group_words(gaussians), strict=True))
+        return every if self.quats else {name: every[name] for name in every if name != QUATS}
 
 
 def coarse_lengths(quats: Words32) -> Doubles:
@@ -106,18 +110,17 @@ def write_low_bits(
 
     Bits beyond the B bytes keep their values.
     """
-    columns = layout.columns
     written = gaussians.detach().to("cpu").map(torch.Tensor.contiguous).map(torch.clone)
+    groups, columns = group_words(written), layout.columns
     for depth, rows, data in parts:
 
         def write(
             start: int, stop: int, depth: int = depth, rows: Integers = rows, data: Bytes = data
         ) -> None:
             own = rows[start:stop]
-            words = np.concatenate([group[own] for group in group_words(written)], axis=1)
+            words, at = np.concatenate([group[own] for group in groups], axis=1), 0
             _unpack(words, columns, depth, data[start:stop].copy())
-            at = 0
-            for group in group_words(written):
+            for group in groups:
                 group[own] = words[:, at : (at := at + group.shape[1])]
 
         in_blocks(write, len(rows), BLOCK, _unpack)
@@ -126,17 +129,18 @@ def write_low_bits(
 
 def used_words(gaussians: Gaussians) -> Words32:
     """[N, F] new bit patterns of log scales, quaternions, opacity logits and harmonics above degree 0."""
-    return np.concatenate(list(group_words(gaussians)), axis=1)
+    return np.concatenate(group_words(gaussians), axis=1)
 
 
-def group_words(gaussians: Gaussians) -> Iterator[Words32]:
-    """The columns [N, C] of `used_words` by group; views where possible."""
-    return map(bit_patterns, groups_of(gaussians))
+def group_words(gaussians: Gaussians) -> list[Words32]:
+    """The columns [N, C] of `used_words` by attribute; views where possible."""
+    attributes = gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:]
+    return [bit_patterns(values) for values in attributes]
 
 
-def groups_of(gaussians: Gaussians) -> tuple[torch.Tensor, ...]:
-    """The attributes [N, ...] of `used_words`."""
-    return gaussians.log_scales, gaussians.quats, gaussians.opacity_logits, gaussians.sh[:, 1:]
+def exponents(words: Words32) -> Bytes:
+    """[...] the biased binary exponents."""
+    return (words >> np.uint32(23) & np.uint32(255)).astype(np.uint8)
 
 
 @kernel
@@ -177,9 +181,5 @@ def _unpack(words: Any, columns: Any, depth: int, data: Any) -> None:
 
 def bit_patterns(values: torch.Tensor) -> Words32:
     """[N, C] bit patterns; a view for contiguous float32 tensors on the CPU."""
-    return words_of(values).reshape(len(values), math.prod(values.shape[1:]))
-
-
-def words_of(values: torch.Tensor) -> Words32:
-    """[N, ...] bit patterns; a view for float32 tensors on the CPU."""
-    return values.detach().to("cpu", torch.float32).numpy().view(np.uint32)
+    words = values.detach().to("cpu", torch.float32).numpy().view(np.uint32)
+    return words.reshape(len(values), math.prod(values.shape[1:]))

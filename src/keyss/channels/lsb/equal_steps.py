@@ -1,4 +1,4 @@
-"""Equal steps: harmonics that predict each other's low bits.
+"""Equal steps: numbers that predict each other's low bits.
 
 Adam's steps do not depend on the size of a gradient. While one of two siblings, Gaussians that density
 control split, is seen alone, or both in one direction, all harmonics of a colour move apart by the same
@@ -30,14 +30,18 @@ from keyss.kernels.parallel import in_blocks
 
 _NEIGHBOURS = 8  # most siblings; detectors that look at 12 find no more than with 12 here
 _EQUAL = 3  # numbers
-_ALIKE, _FURTHER = 2, 1 << 8  # pairs of a Gaussian by sums of three harmonics, and how many are looked at
+_PARTNERS, _WINDOW = 2, 1 << 8  # of a Gaussian among distant ones, and how many are looked at
 _ROWS = 1 << 11  # that a thread takes at a time
 _SAMPLE = 8000  # Gaussians whose pairs of numbers are tested
 _DRAWS = 16
 _PARTS = np.array([[1 / 16], [1 / 8], [1 / 4]])  # of a cell
-_ZERO, _COLOURS = -1, -2  # what a Gaussian is compared with, instead of another one
+_ZERO, _COLOURS, _NOTHING = -1, -2, -3  # what a Gaussian is compared with, instead of another one
 _KINDS = _GEOMETRY, _HARMONICS, _BETWEEN_COLOURS = 0, 1, 2
-_FEW, _LANES = 4, 16  # numbers of a group: geometry, and harmonics; as many as a processor compares at once
+_FIRST, _LANES = (
+    16,
+    48,
+)  # place of the harmonics of degrees 1 to 3 among a Gaussian's numbers, and room for them
+_BLOCK = 16  # points that a sweep looks at at once
 _NAN, _EXPONENT, _MAGNITUDE = np.uint32(0x7FC00000), np.uint32(0x7F800000), np.uint32(0x7FFFFFFF)
 
 
@@ -49,35 +53,42 @@ class Steps:
 
     def __init__(self, gaussians: Gaussians, layout: Layout) -> None:
         means = np.nan_to_num(doubles(gaussians.means), posinf=0, neginf=0)
+        near = min(_NEIGHBOURS, max(0, len(means) - 1))
         self.order = morton_order(means.astype(np.float32))  # what neighbours share stays in the cache
-        self.near = np.empty((len(means), min(_NEIGHBOURS, max(0, len(means) - 1))), np.int32)
-        if self.near.size:
-            tree = Neighbours(means, self.near.shape[1] + 1)
+        self.others = np.full((len(means), 2 + near), _ZERO, np.int32)  # that a Gaussian is compared with
+        self.others[:, 1] = _COLOURS
+        if near:
+            tree = Neighbours(means, near + 1)
 
             def search(start: int, stop: int) -> None:
                 rows = self.order[start:stop]
-                self.near[rows] = tree.of(means[rows])[1][:, 1:]
+                self.others[rows, 2:] = tree.of(means[rows])[1][:, 1:]
+
+            def drop(start: int, stop: int) -> None:
+                _drop_mutual(self.order[start:stop], self.others)
 
             in_blocks(search, len(means), _ROWS)
+            in_blocks(drop, len(means), _ROWS, _drop_mutual)
         self.words = _words(gaussians, layout)
-        self.alike = _alike(self.words[1])
+        self.distant = _distant_siblings(self.words[1])
 
     def equal(self, depth: int, among: Flags | None = None) -> Flags:
         """Mask [N] of Gaussians that moved by equal amounts, by the bits that stay at a depth.
 
         `among` [N]: those that did at a larger depth, where steps are less exact.
         """
-        rows, alike = self.order, self.alike
+        rows, distant = self.order, self.distant
         if among is not None:
-            rows, alike = rows[among[rows]], alike[among[alike[:, 0]]]
-        apart = np.zeros(len(self.order), bool)
+            rows, distant = rows[among[rows]], distant[:, among[distant[0]]]
+        moved = np.zeros(len(self.order), bool)
 
         def mark(start: int, stop: int) -> None:
-            _mark(self._pairs(rows[start:stop], _COLOURS, _ZERO), *self.words, depth, apart)
+            own = rows[start:stop]
+            _mark(own, self.others[own], *self.words, depth, moved)
 
         in_blocks(mark, len(rows), _ROWS, _mark)
-        _mark(alike, *self.words, depth, apart)
-        return apart
+        _mark(distant[0], distant[1, :, None].astype(np.int32), *self.words, depth, moved)
+        return moved
 
     def chance(self, depth: int, usable: Flags) -> float:
         """p-value of low bits that follow from each other, for new low bits of the `usable` [N] Gaussians.
@@ -89,12 +100,10 @@ class Steps:
 
         rows, random, chances = self.order[usable[self.order]], np.random.default_rng(0), [1.0]
         rows = rows[:: max(1, len(rows) // _SAMPLE)]
-        pairs = self._pairs(rows, _COLOURS)
-        pairs = pairs[(pairs[:, 1] < 0) | (pairs[:, 0] < pairs[:, 1])]  # each counts once
         found, count = np.empty((0, 7), np.uint32), 0
         while count == len(found):
             found = np.empty((2 * len(found) + len(rows) + 1, 7), np.uint32)
-            count = _list(pairs, *self.words, depth, found)
+            count = _list(rows, self.others[rows][:, 1:], *self.words, depth, found)
         for kind in _KINDS:
             own = found[:count][found[:count, 6] == kind]
             words, written = own[:, :4], usable[np.tile(own[:, 4:6], 2)]
@@ -104,19 +113,12 @@ class Steps:
             chances += pdtrc(hits - 1.0, np.maximum(drawn, 1) / _DRAWS)[hits > 0].tolist()
         return min(1.0, min(chances) * len(_KINDS) * len(_PARTS))
 
-    def _pairs(self, rows: Integers, *others: int) -> Integers:
-        """[P, 2] pairs of `rows` [R] with `others` and with their nearest neighbours."""
-        every = [np.full((len(rows), 1), other) for other in others] + [self.near[rows]]
-        beside = np.concatenate(every, axis=1)
-        return np.stack([rows.repeat(beside.shape[1]), beside.ravel()], axis=1)
-
 
 def moved_from_zero(gaussians: Gaussians, layout: Layout) -> Flags:
     """Mask [N] of Gaussians whose numbers moved by equal amounts away from zero, at the least depth."""
-    apart = np.zeros(len(gaussians), bool)
-    pairs = np.stack([np.arange(len(apart)), np.full(len(apart), _ZERO)], axis=1)
-    _mark(pairs, *_words(gaussians, layout), LEAST, apart)
-    return apart
+    moved, rows = np.zeros(len(gaussians), bool), np.arange(len(gaussians))
+    _mark(rows, np.full((len(rows), 1), _ZERO, np.int32), *_words(gaussians, layout), LEAST, moved)
+    return moved
 
 
 def redrawn(words: Words32, chosen: Flags, depth: int, random: np.random.Generator) -> Words32:
@@ -130,35 +132,43 @@ def redrawn(words: Words32, chosen: Flags, depth: int, random: np.random.Generat
 def _words(gaussians: Gaussians, layout: Layout) -> tuple[Words32, Words32]:
     """Bit patterns of what may move by equal steps.
 
-    Scales and opacity [N, 4, 1] or, with quaternions, [N, 4, 2]; all coefficients of all colours [N, K, 3].
+    Scales and opacity [N, 4] or, each beside a part of the quaternion, [N, 8]; harmonics of all colours
+    [N, 3 K], the constant ones first.
     """
-    geometry = torch.cat([gaussians.log_scales, gaussians.opacity_logits[:, None]], dim=1)[:, :, None]
+    geometry = torch.cat([gaussians.log_scales, gaussians.opacity_logits[:, None]], dim=1)
     if layout.quats:
-        geometry = torch.cat([geometry, gaussians.quats[:, :, None]], dim=2)
-    sh = gaussians.sh
-    return bit_patterns(geometry).reshape(geometry.shape), bit_patterns(sh).reshape(sh.shape)
+        geometry = torch.stack([geometry, gaussians.quats], dim=2)
+    return bit_patterns(geometry), bit_patterns(gaussians.sh)
 
 
-def _alike(sh: Words32) -> Integers:
-    """[P, 2] Gaussians in which the harmonics of degree 1 of a colour may have moved by equal amounts.
+def _distant_siblings(sh: Words32) -> Integers:
+    """[2, P] Gaussians in which the harmonics of degree 1 of a colour may have moved by equal amounts.
 
     For any signs of the steps, two sums or differences are equal, up to the precision of the bits that stay.
     """
 
-    def search(colour: int, _: int) -> Integers:
-        words, pairs = np.ascontiguousarray(sh[:, 1:4, colour].T), list[Integers]()
-        numbers = (words & ~LOW | (LOW + 1) >> 1).view(np.float32)
+    def search(task: int, _: int) -> Integers:
+        words, sign = np.ascontiguousarray(sh[:, 3 + task // 2 : 12 : 3].T), np.float32(1 - task % 2 * 2)
+        first, second, third = (words & ~LOW | (LOW + 1) >> 1).view(np.float32)
         cells = (words & _EXPONENT).view(np.float32).max(axis=0) * np.float32(2.0 ** (DEEPEST + 2 - 23))
-        for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-            with np.errstate(over="ignore", invalid="ignore"):
-                one, other = (numbers[0] + sign * numbers[at] for at, sign in enumerate(signs, 1))
-            order = one.argsort(kind="stable")  # the same on every processor
-            found = np.empty((_ALIKE * len(order), 2), np.int64)
-            pairs.append(order[found[: _meet(one[order], other[order], cells[order], found)]])
-        return np.concatenate(pairs)
+        with np.errstate(over="ignore", invalid="ignore"):
+            sums = first + sign * second
+            others = first + third, first - third
+        sums[np.isnan(sums)] = np.inf  # the sign of NaN depends on the processor
+        # Sorted with their rows in the lower half: the same on all processors, and faster than `argsort`.
+        keys = sums.view(np.int32)
+        keys = (keys ^ (keys >> 31 & 0x7FFFFFFF)).astype(np.int64) << 32 | np.arange(len(keys))
+        keys.sort()
+        order, pairs = keys & 0xFFFFFFFF, []
+        sums, cells = sums[order], cells[order]
+        for other in others:
+            found = np.empty((_PARTNERS * len(order), 2), np.int64)
+            count = _sweep(sums, np.pad(other[order], (0, _BLOCK)), cells, found)
+            pairs.append(order[found[:count].T])
+        return np.concatenate(pairs, axis=1)
 
-    colours = in_blocks(search, 3 if sh.shape[1] > 1 else 0, 1, _meet)
-    return np.concatenate([np.empty((0, 2), np.int64), *colours])
+    colours = in_blocks(search, 6 if sh.shape[1] > 3 else 0, 1, _sweep)
+    return np.concatenate([np.empty((2, 0), np.int64), *colours], axis=1)
 
 
 def _hits(words: Words32, depth: int) -> Integers:
@@ -171,136 +181,167 @@ def _hits(words: Words32, depth: int) -> Integers:
 
 
 @kernel
-def _meet(first: Any, second: Any, cells: Any, found: Any) -> int:
-    """List pairs of points (first, second), by ascending `first`, that agree within `cells` [N]; how many."""
+def _sweep(first: Any, second: Any, cells: Any, found: Any) -> int:
+    """List pairs of points (first, second), by ascending `first`, that agree within `cells` [N]; how many.
+
+    `second` [N + _BLOCK]: padded.
+    """
     count = 0
     for one in range(len(first)):
-        most = count + _ALIKE
-        for other in range(one + 1, min(one + _FURTHER, len(first))):
-            if count == most or first[other] - first[one] >= cells[one]:
+        most, end = count + _PARTNERS, min(one + _WINDOW, len(first))
+        for start in range(one + 1, end, _BLOCK):
+            if count == most or first[start] - first[one] >= cells[one]:
                 break
-            if abs(second[other] - second[one]) < cells[one]:
-                found[count, 0], found[count, 1] = one, other
-                count += 1
+            near = 0
+            for at in range(start, start + _BLOCK):
+                near += abs(second[at] - second[one]) < cells[one]
+            for other in range(start, min(start + _BLOCK, end) if near else start):
+                if count == most or first[other] - first[one] >= cells[one]:
+                    break
+                if abs(second[other] - second[one]) < cells[one]:
+                    found[count, 0], found[count, 1] = one, other
+                    count += 1
     return count
+
+
+@kernel
+def _drop_mutual(rows: Any, others: Any) -> None:
+    """Replace neighbours of which a Gaussian is a neighbour, too, and comes first, by _NOTHING."""
+    for one in rows:
+        for each in range(2, others.shape[1]):
+            other = others[one, each]
+            for its in range(2, others.shape[1] if other < one else 0):
+                if others[other, its] == one:
+                    others[one, each] = _NOTHING
 
 
 @inline
 def _read(geometry: Any, sh: Any, row: Any, words: Any) -> None:
-    """Set `words` [groups, _LANES] to the numbers of a Gaussian."""
-    quats = geometry.shape[2]
-    for group in range(quats):
-        for at in range(4):
-            words[group, at] = geometry[row, at, group]
-    for at in range(1, sh.shape[1]):  # constant colours are never written
-        for colour in range(len(words) - quats):
-            words[quats + colour, at - 1] = sh[row, at, colour]
+    """Set `words` [_FIRST + _LANES] to the numbers of a Gaussian."""
+    row = np.uint64(row)  # unsigned indices, which are not tested for being negative, take half of the time
+    for at in range(np.uint64(geometry.shape[1])):
+        words[at] = geometry[row, at]
+    for at in range(np.uint64(3), np.uint64(sh.shape[1])):  # constant colours are never written
+        words[at + np.uint64(_FIRST - 3)] = sh[row, at]
 
 
 @inline
 def _read_other(geometry: Any, sh: Any, row: Any, x: Any, y: Any) -> None:
-    """Set `y` [groups, _LANES] to the numbers of what a Gaussian with the numbers x is compared with.
+    """Set `y` to the numbers of what a Gaussian with the numbers x is compared with.
 
     For _COLOURS, the next colours, with the signs of x; geometry is equal to nothing.
     """
     if row >= 0:
         _read(geometry, sh, row, y)
-    for group in range(len(x) if row < 0 else 0):
-        source = geometry.shape[2] + (group - geometry.shape[2] + 1) % 3
-        for at in range(_LANES):
-            y[group, at] = np.uint32(0) if row == _ZERO else _NAN
-            if row == _COLOURS and group >= geometry.shape[2]:
-                y[group, at] = x[source, at] & _MAGNITUDE | x[group, at] & ~_MAGNITUDE
+        return
+    for at in range(_FIRST + _LANES):
+        y[at] = np.uint32(0) if row == _ZERO else _NAN
+    for at in range(_LANES if row == _COLOURS else 0):
+        following = _FIRST + at // 3 * 3 + (at + 1) % 3
+        y[_FIRST + at] = x[following] & _MAGNITUDE | x[_FIRST + at] & ~_MAGNITUDE
 
 
 @inline
 def _compare(x: Any, y: Any, depth: Any, known: Any, steps: Any, cells: Any) -> None:
-    """Set `steps` [groups, _LANES] to the differences of x and y by the bits that stay at a depth.
+    """Set `steps` and `cells` to the differences of x and y by the bits that stay at a depth.
 
-    `cells`: the larger one of x and y. `known` [3, groups, _LANES]: scratch memory.
+    `cells`: the larger one of x and y. `known` [3, _FIRST + _LANES]: scratch memory.
     """
     low, half = np.uint32((1 << depth + 1) - 1), np.uint32(1 << depth)
-    share = np.float32(2.0 ** (depth + 1 - 23))
-    numbers = known.view(np.float32)
-    for group in range(len(x)):
-        for at in range(_LANES):
-            a, b = x[group, at], y[group, at]
-            known[0, group, at], known[1, group, at] = a & ~low | half, b & ~low | half
-            known[2, group, at] = max(a & _EXPONENT, b & _EXPONENT)
-        for at in range(_LANES):
-            steps[group, at] = abs(numbers[0, group, at] - numbers[1, group, at])
-            cells[group, at] = numbers[2, group, at] * share
+    share, numbers = np.float32(2.0 ** (depth + 1 - 23)), known.view(np.float32)
+    for at in range(_FIRST + _LANES):
+        known[0, at], known[1, at] = x[at] & ~low | half, y[at] & ~low | half
+        known[2, at] = max(x[at] & _EXPONENT, y[at] & _EXPONENT)
+    for at in range(_FIRST + _LANES):
+        steps[at] = abs(numbers[0, at] - numbers[1, at])
+        cells[at] = numbers[2, at] * share
 
 
 @inline
-def _most_equal(steps: Any, cells: Any, group: Any, lanes: Any) -> Any:
-    """The largest number of equal steps among the first `lanes` of a group."""
-    most = np.int32(0)
-    for at in range(lanes):
-        agree = np.int32(0)
-        for each in range(lanes):
-            cell = max(cells[group, at], cells[group, each])
-            agree += np.int32(abs(steps[group, at] - steps[group, each]) <= cell)
-        most = max(most, agree)
+def _agree(steps: Any, cells: Any, one: Any, other: Any) -> Any:
+    return abs(steps[one] - steps[other]) <= max(cells[one], cells[other])
+
+
+@inline
+def _most_pairs(steps: Any, cells: Any, first: Any, lanes: Any, lags: Any, groups: Any, count: Any) -> Any:
+    """How many pairs of numbers agree in groups of `count`, from lane `first` on, at most.
+
+    Fast, because it compares all numbers of a ring with those 1 to `lags` further: half of their number.
+    """
+    pairs, start, stride = np.int32(0), np.uint64(first), np.uint64(groups)
+    for at in range(start, start + np.uint64(lanes // 2)):
+        again = at + np.uint64(groups * count)
+        steps[again], cells[again] = steps[at], cells[at]
+    for at in range(start, start + np.uint64(lanes)):
+        for lag in range(lags):
+            pairs += np.int32(_agree(steps, cells, at, at + np.uint64(lag + 1) * stride))
+    return pairs
+
+
+@inline
+def _most_equal(steps: Any, cells: Any, first: Any, groups: Any, count: Any) -> Any:
+    """How many of the `count` numbers of a group agree with one of them, at most; see `_most_pairs`."""
+    most, end = 0, first + groups * count
+    for one in range(first, end):
+        equal = 0
+        for other in range(first + (one - first) % groups, end, groups):
+            equal += _agree(steps, cells, one, other)
+        most = max(most, equal)
     return most
 
 
 @kernel
-def _mark(pairs: Any, geometry: Any, sh: Any, depth: int, apart: Any) -> None:
-    """Set `apart` [N] for `pairs` [P, 2] in which _EQUAL numbers of a group moved by equal amounts."""
-    groups, last = geometry.shape[2] + 3 * (sh.shape[1] > 1), -1
-    x = np.full((groups, _LANES), _NAN, np.uint32)  # unused lanes are equal to nothing
-    y, known = np.zeros((groups, _LANES), np.uint32), np.empty((3, groups, _LANES), np.uint32)
-    steps, cells = np.empty((groups, _LANES), np.float32), np.empty((groups, _LANES), np.float32)
-    for pair in range(len(pairs)):
-        one, other = pairs[pair]
-        if apart[one] and (other < 0 or apart[other]):
-            continue
-        if one != last:
-            _read(geometry, sh, one, x)
-            last = one
-        _read_other(geometry, sh, other, x, y)
-        _compare(x, y, depth, known, steps, cells)
-        equal = False
-        for group in range(groups):
-            if group < geometry.shape[2]:
-                equal |= _most_equal(steps, cells, group, _FEW) >= _EQUAL
-            else:
-                equal |= _most_equal(steps, cells, group, _LANES) >= _EQUAL
-        if equal:
-            apart[one] = True
-            if other >= 0:
-                apart[other] = True
+def _mark(rows: Any, others: Any, geometry: Any, sh: Any, depth: int, moved: Any) -> None:
+    """Set `moved` [N] for `rows` [R] and `others` [R, K] in which _EQUAL numbers of a group moved equally."""
+    quats, harmonics, size = geometry.shape[1] // 4, sh.shape[1] // 3 - 1, _FIRST + _LANES
+    x, y, known = np.full(size, _NAN), np.full(size, _NAN), np.empty((3, size), np.uint32)
+    steps, cells = np.full(2 * size, np.float32(np.nan)), np.zeros(2 * size, np.float32)
+    for row in range(len(rows)):
+        one = rows[row]
+        _read(geometry, sh, one, x)
+        for column in range(others.shape[1]):
+            other = others[row, column]
+            if other == _NOTHING or (moved[one] and (other < 0 or moved[other])):
+                continue
+            _read_other(geometry, sh, other, x, y)
+            _compare(x, y, depth, known, steps, cells)
+            pairs = _most_pairs(steps, cells, 0, 8, 2, quats, 4)
+            pairs += _most_pairs(steps, cells, _FIRST, _LANES, 7, 3, harmonics)
+            if pairs < _EQUAL - 1:
+                continue
+            equal = _most_equal(steps, cells, 0, quats, 4)
+            if max(equal, _most_equal(steps, cells, _FIRST, 3, harmonics)) >= _EQUAL:
+                moved[one] = True
+                if other >= 0:
+                    moved[other] = True
 
 
 @kernel
-def _list(pairs: Any, geometry: Any, sh: Any, depth: int, found: Any) -> int:
-    """List two numbers that differ by equal steps in `pairs` [P, 2]; how many.
+def _list(rows: Any, others: Any, geometry: Any, sh: Any, depth: int, found: Any) -> int:
+    """List two numbers that differ by equal steps in `rows` [R] and `others` [R, K]; how many.
 
     `found` [M, 7]: first number of both Gaussians, second number, the Gaussians (one for _COLOURS), kind.
     Lists at most M. Steps of up to two cells are small by chance.
     """
-    groups, count = geometry.shape[2] + 3 * (sh.shape[1] > 1), 0
-    x, y = np.full((groups, _LANES), _NAN, np.uint32), np.zeros((groups, _LANES), np.uint32)
-    known = np.empty((3, groups, _LANES), np.uint32)
-    steps, cells = np.empty((groups, _LANES), np.float32), np.empty((groups, _LANES), np.float32)
-    for pair in range(len(pairs)):
-        one, other = pairs[pair]
+    quats, size, count = geometry.shape[1] // 4, _FIRST + _LANES, 0
+    x, y, known = np.full(size, _NAN), np.full(size, _NAN), np.empty((3, size), np.uint32)
+    steps, cells = np.empty(size, np.float32), np.empty(size, np.float32)
+    for row in range(len(rows)):
+        one = rows[row]
         _read(geometry, sh, one, x)
-        _read_other(geometry, sh, other, x, y)
-        _compare(x, y, depth, known, steps, cells)
-        for group in range(groups):
-            for at in range(_LANES):
-                for each in range(at):
-                    cell, step = max(cells[group, at], cells[group, each]), steps[group, at]
-                    if abs(step - steps[group, each]) <= cell and step > 2 * cell:
+        for other in others[row]:
+            _read_other(geometry, sh, other, x, y)
+            _compare(x, y, depth, known, steps, cells)
+            for at in range(size):
+                first, groups = (0, quats) if at < _FIRST else (_FIRST, 3)
+                for each in range(first + (at - first) % groups, at, groups):
+                    if _agree(steps, cells, at, each) and steps[at] > 2 * max(cells[at], cells[each]):
                         if count == len(found):
                             return count
-                        row = found[count]
-                        row[0], row[1] = x[group, at], y[group, at]
-                        row[2], row[3] = x[group, each], y[group, each]
-                        row[4], row[5], row[6] = one, max(one, other), _GEOMETRY
-                        if group >= geometry.shape[2]:
-                            row[6] = _HARMONICS if other >= 0 else _BETWEEN_COLOURS
+                        entry = found[count]
+                        entry[0], entry[1], entry[2], entry[3] = x[at], y[at], x[each], y[each]
+                        entry[4], entry[5], entry[6] = one, max(one, other), _GEOMETRY
+                        if at >= _FIRST:
+                            entry[6] = _HARMONICS if other >= 0 else _BETWEEN_COLOURS
                         count += 1
     return count

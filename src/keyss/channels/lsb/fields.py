@@ -24,9 +24,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from keyss.channels.lsb.usable import repeated
 from keyss.channels.mixing import row_hashes
-from keyss.core.arrays import Bytes, Doubles, Flags, Floats, Integers, Numbers, Words
+from keyss.core.arrays import Bytes, Doubles, Flags, Floats, Integers, Numbers, Words, repeated
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import Codes, morton_order
 from keyss.files.formats.compressed_ply import CHUNK, CompressedPlyCodes

@@ -4,10 +4,11 @@ IDs of Gaussians and a key tell where a secret lies (see `shards`), with redunda
 and a quarter of the Gaussians may be lost. A file has no magic number and no index of its secrets. Carriers,
 the usable Gaussians, are chosen at random, and unused ones get noise, so the number of secrets does not show.
 
-A *salt* of Argon2id is a hash of one Gaussian that holds nothing else. A salt is *stale* if its Gaussian is
-not usable (see `usable`): the author of the cover knows it in advance, so no key is written under it. A
-reader tries SALTS_TRIED salts; covers with as many stale ones among the first 2 SALTS_TRIED are refused: in
-others, random removal of a quarter leaves it no fresh one with p < 3e-4.
+A *salt* of Argon2id is a hash of one Gaussian, which holds nothing else and gets new low bits in every file.
+If that Gaussian is not usable (see `usable`), its bits stay, and the author of the cover can compute the salt
+in advance: it is *stale*, and no key is written under it. A reader tries the first SALTS_TRIED salts of a
+file and needs a fresh one among them. Covers with fewer than SALTS_TRIED stale salts among the first
+2 SALTS_TRIED leave it one after random removal of a quarter, but for p < 3e-4; others are refused.
 """
 
 from __future__ import annotations
@@ -36,10 +37,10 @@ from keyss.channels.lsb.low_bits_capacity import (
 )
 from keyss.channels.lsb.salts import salt, salt_rows
 from keyss.channels.lsb.shards import Shards, is_tagged, shard_bytes
-from keyss.channels.lsb.usable import Carriers, repeated
+from keyss.channels.lsb.usable import Carriers
 from keyss.channels.mixing import random_order
 from keyss.channels.reed_solomon import Codewords
-from keyss.core.arrays import Bytes, Flags, Integers
+from keyss.core.arrays import Bytes, Flags, Integers, repeated
 from keyss.core.errors import UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.kernels.parallel import in_blocks
@@ -245,7 +246,7 @@ class LowBitsReader(SaltedReader):
         record, payload = container.unseal_shards(data_key, codewords, numbers, shards, EXACT_BYTES)
         return replace(
             payload,
-            shards=(len(np.unique(numbers)), codewords.shards),
+            shards=(int((np.bincount(numbers) > 0).sum()), codewords.shards),
             foreign=exact_foreign(record, data_key, self.ids),
         )
 

@@ -13,7 +13,7 @@ import hashlib
 import numpy as np
 import torch
 
-from keyss.channels.lsb.bits import BLOCK, LEAST, Layout, read_low_bits, used_words
+from keyss.channels.lsb.bits import BLOCK, LEAST, Layout, exponents, read_low_bits, used_words
 from keyss.channels.lsb.equal_steps import moved_from_zero
 from keyss.core.arrays import Bytes, Integers, Words
 from keyss.core.gaussians import Gaussians
@@ -30,33 +30,31 @@ def salt_rows(gaussians: Gaussians, ids: Bytes, layout: Layout) -> Integers:
     """Rows of the salts' Gaussians, at most SALTS, in the order of the salts; `ids` [N, 16]."""
     numbers = ids[:, :8].copy().view(">u8")[:, 0].astype(np.uint64)
     rows = np.argpartition(numbers, _FIRST)[:_FIRST] if len(ids) > _FIRST else np.arange(len(ids))
-    late = _lateness(gaussians[torch.from_numpy(rows)], layout)
-    if (late == 0).sum() < SALTS:  # of the smallest IDs too few
-        rows, late = np.arange(len(ids)), _lateness(gaussians, layout)
-    keys = late << np.uint64(56) | numbers[rows] >> np.uint64(8)
+    ranks = _ranks(gaussians[torch.from_numpy(rows)], layout)
+    if (ranks == 0).sum() < SALTS:  # of the smallest IDs too few
+        rows, ranks = np.arange(len(ids)), _ranks(gaussians, layout)
+    keys = ranks << np.uint64(56) | numbers[rows] >> np.uint64(8)
     best = np.argpartition(keys, SALTS - 1)[:SALTS] if len(keys) > SALTS else np.arange(len(keys))
     low = read_low_bits(gaussians[torch.from_numpy(rows[best])], LEAST, layout)
     places = [
-        (late[each], ids[rows[each]].tobytes(), own.tobytes()) for each, own in zip(best, low, strict=True)
+        (ranks[each], ids[rows[each]].tobytes(), own.tobytes()) for each, own in zip(best, low, strict=True)
     ]
     return rows[best[sorted(range(len(best)), key=places.__getitem__)]]
 
 
-def _lateness(gaussians: Gaussians, layout: Layout) -> Words:
+def _ranks(gaussians: Gaussians, layout: Layout) -> Words:
     """[N] octaves by which the smallest even number lies below _LARGE_ENOUGH, 0 for larger ones.
 
     255 for Gaussians that moved by equal steps away from zero.
     """
 
-    def work(start: int, stop: int) -> Words:
+    def rank(start: int, stop: int) -> Words:
         used = used_words(gaussians[start:stop])[:, layout.columns]
-        below = np.where(
-            used & 1 == 0, _LARGE_ENOUGH - (used >> np.uint32(23) & np.uint32(255)).astype(np.int64), 0
-        )
-        smallness: Words = below.max(axis=1, initial=0).astype(np.uint64)
-        return smallness
+        below = np.where(used & 1 == 0, _LARGE_ENOUGH - exponents(used).astype(np.int64), 0)
+        octaves: Words = below.max(axis=1, initial=0).astype(np.uint64)
+        return octaves
 
-    small = np.concatenate([np.zeros(0, np.uint64), *in_blocks(work, len(gaussians), BLOCK)])
+    small = np.concatenate([np.zeros(0, np.uint64), *in_blocks(rank, len(gaussians), BLOCK)])
     return np.where(moved_from_zero(gaussians, layout), np.uint64(255), small)
 
 

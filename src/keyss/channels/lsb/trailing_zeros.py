@@ -20,14 +20,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from keyss.core.arrays import Doubles, Flags, Integers, Words32
+from keyss.core.arrays import Doubles, Integers, Words32
 
 _MAX_ZEROS = 12  # counted at most; numbers with more are rare, or short
 _EXPONENTS = 256
 _NUMBERS = np.arange(1 << _MAX_ZEROS, dtype=np.uint32)[:, None] | np.uint32(1 << _MAX_ZEROS)
-_ZEROS = (
-    (_NUMBERS >> np.arange(_MAX_ZEROS + 1, dtype=np.uint32) & 1).argmax(axis=1).astype(np.uint32)
-)  # [4096], trailing
+_ZEROS = (_NUMBERS >> np.arange(_MAX_ZEROS + 1, dtype=np.uint32) & 1).argmax(axis=1).astype(np.uint32)
 _UNIFORM = 0.5 ** np.append(np.arange(1, _MAX_ZEROS), _MAX_ZEROS - 1)  # of 1 to 12 zeros of even numbers
 # Drop of the log-likelihood at the confidence limit: one-sided, one in 200.
 _DROP = 3.3
@@ -35,16 +33,11 @@ _MARGIN, _STEP = 8, 0.25  # range beyond the numbers' exponents and resolution o
 _LARGEST = 4  # octaves of the scale below the median number: steps of a sixteenth would never converge
 
 
-def count_trailing_zeros(words: Words32, chosen: Flags) -> Integers:
-    """[_EXPONENTS, _MAX_ZEROS + 1] counts of numbers by exponent and trailing zeros.
-
-    `words` [N, C]; `chosen` [N]: mask of the rows to count.
-    """
-    own = words[chosen].ravel()
-    kinds = (own >> np.uint32(23) & np.uint32(255)) * np.uint32(_MAX_ZEROS + 1) + _ZEROS[
-        own & np.uint32(4095)
-    ]
-    return np.bincount(kinds, minlength=_EXPONENTS * (_MAX_ZEROS + 1)).reshape(_EXPONENTS, -1)
+def count_trailing_zeros(words: Words32) -> Integers:
+    """[_EXPONENTS, _MAX_ZEROS + 1] counts of the numbers `words` [...] by exponent and trailing zeros."""
+    exponents = words >> np.uint32(23) & np.uint32(255)
+    kinds = exponents * np.uint32(_MAX_ZEROS + 1) + _ZEROS[words & np.uint32(len(_ZEROS) - 1)]
+    return np.bincount(kinds.ravel(), minlength=_EXPONENTS * (_MAX_ZEROS + 1)).reshape(_EXPONENTS, -1)
 
 
 def least_exponent(counts: Integers, share: float) -> int:

@@ -20,31 +20,33 @@ docs/threat-model.md tells what each hides.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from keyss.channels.lsb.bits import (
+    ATTRIBUTES,
     BLOCK,
     DEEPEST,
     DEPTHS,
-    GEOMETRY,
+    HARMONICS,
     LEAST,
     LOW,
+    OPACITIES,
     QUATS,
+    SCALES,
     UNIT_TOLERANCE,
     Layout,
     coarse_lengths,
+    exponents,
     gaussian_ids,
-    groups_of,
-    used_words,
-    words_of,
 )
 from keyss.channels.lsb.equal_steps import Steps
 from keyss.channels.lsb.trailing_zeros import count_trailing_zeros, least_exponent
 from keyss.channels.mixing import row_hashes
-from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Numbers, Words, Words32
+from keyss.core.arrays import Bytes, Doubles, Flags, Integers, Words32, among, frequent, repeated
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.kernels.parallel import in_blocks
@@ -53,14 +55,7 @@ from keyss.kernels.parallel import in_blocks
 # knows the trainer and the plain file's statistics. 0.03 is an AUC of 0.55.
 MAX_SEPARATION = 0.03
 
-_GROUPS = {
-    "log scales": slice(0, 3),
-    "quaternions": QUATS,
-    "opacity logits": slice(7, 8),
-    "harmonics": slice(GEOMETRY, None),
-}
 _MAGNITUDE = np.uint32(0x7FFFFFFF)
-_OPACITY = 7
 # Bit patterns of logits above 16. The sigmoid is 1 above 16.64, but only the exponent never changes.
 _SATURATED = np.uint32(0x41800000), np.uint32(0x80000000)
 _PRUNED = np.float32(math.log(0.005 / 0.995)).view(np.uint32) | LOW  # the logit of 0.005, without low bits
@@ -87,22 +82,22 @@ class Carriers:
     def of(gaussians: Gaussians, layout: Layout) -> Carriers:
         """Raises UsageError, with what shows, if new low bits would show even at the least depth.
 
-        A sample of a large cover is tested first: the whole takes a second for each 100,000 Gaussians.
+        A sample of a large cover is tested first: the whole takes 0.7 s for each 100,000 Gaussians.
         """
         if len(gaussians) > _LARGE:
             sample = gaussians[:: len(gaussians) // _SAMPLE]
             Carriers.of(sample, Layout.of(sample))
         ids, steps = gaussian_ids(gaussians, layout), Steps(gaussians, layout)
-        fine, apart = _without_copies(gaussians, layout, ids), steps.equal(DEEPEST)
-        fine &= _large_enough(gaussians, layout, fine & ~apart)
-        usable, deepest = fine & ~apart, 0
+        fine, equal = _without_coincidences(gaussians, layout, ids), steps.equal(DEEPEST)
+        fine &= _without_small_even(gaussians, layout, fine & ~equal)
+        usable, deepest = fine & ~equal, 0
         for depth in DEPTHS:
             if told := _what_tells(gaussians, layout, usable, depth, steps):
                 if depth == LEAST:
                     raise UsageError(told)
                 break
             deepest = depth
-        return Carriers(ids, usable, deepest, fine & ~steps.equal(LEAST, apart))
+        return Carriers(ids, usable, deepest, fine & ~steps.equal(LEAST, equal))
 
 
 def usable_carriers(gaussians: Gaussians) -> Flags:
@@ -122,24 +117,31 @@ def _what_tells(gaussians: Gaussians, layout: Layout, usable: Flags, depth: int,
             "hold short, repeated or predictable values: it was quantised or hardly trained, and new bits "
             "would be seen"
         )
-    used = used_words(gaussians[torch.from_numpy(rows[:: max(1, len(rows) // _SAMPLE)])])
-    for name, group in _GROUPS.items():
-        written = used[:, np.intersect1d(np.arange(used.shape[1])[group], layout.columns)]
-        if written.size and (chance := chance_of_bits(written, depth + 1)) < _CHANCE:
-            return (
-                f"the low bits of {name} in this cover are not random (p = {chance:.0e}), and new ones "
-                "would be seen: the cover was quantised, scaled or moved after its training"
+    groups = layout.groups(gaussians[torch.from_numpy(rows[:: max(1, len(rows) // _SAMPLE)])])
+
+    def tests() -> Iterator[tuple[float, str, str]]:
+        for name, words in groups.items():
+            if words.size:
+                relation = f"the low bits of {name} in this cover are not random"
+                yield (
+                    chance_of_bits(words, depth + 1),
+                    relation,
+                    "quantised, scaled or moved after its training",
+                )
+        if depth == LEAST:
+            relation = "harmonics of this cover are multiples of one step"
+            yield (
+                chance_of_lattice(groups[HARMONICS]),
+                relation,
+                "multiplied, as by an edit of its brightness",
             )
-    if depth == LEAST and (chance := chance_of_lattice(used)) < _CHANCE:
-        return (
-            f"numbers of this cover are multiples of one step (p = {chance:.0e}), and new low bits would be "
-            "seen: its colours were multiplied after training, as an edit of their brightness does"
-        )
-    if (chance := steps.chance(depth, usable)) < _CHANCE:
-        return (
-            f"numbers of this cover predict each other's low bits (p = {chance:.0e}), because they moved by "
-            "equal steps, and new ones would be seen: it was hardly trained, or seen from one direction"
-        )
+        relation = "numbers of this cover predict each other's low bits"
+        cause = "hardly trained, or seen from one direction, so that they moved by equal steps"
+        yield steps.chance(depth, usable), relation, cause
+
+    for chance, relation, cause in tests():
+        if chance < _CHANCE:
+            return f"{relation} (p = {chance:.0e}), and new ones would be seen: the cover was {cause}"
     return ""
 
 
@@ -151,7 +153,7 @@ def chance_of_bits(words: Words32, bits: int) -> float:
     from scipy.special import bdtr  # takes long to load
 
     flat = words.ravel()
-    context = _exponents(flat).astype(np.int64) << 2 | (flat & 1).astype(np.int64) << 1
+    context = exponents(flat).astype(np.int64) << 2 | (flat & 1).astype(np.int64) << 1
     chances: list[Doubles] = []
     for bit in range(1, bits):
         below = (flat >> np.uint32(bit - 1) & 1).astype(np.int64) if bit > 1 else 0
@@ -164,8 +166,8 @@ def chance_of_bits(words: Words32, bits: int) -> float:
     return min(1.0, float(every.min() * len(every)))
 
 
-def chance_of_lattice(used: Words32) -> float:
-    """p-value of harmonics on a lattice, for uniform mantissas; `used` [N, F].
+def chance_of_lattice(harmonics: Words32) -> float:
+    """p-value of harmonics [N, 3 K] on a lattice, for uniform mantissas.
 
     A factor that is no power of two maps the floats of one exponent to a lattice, whose period shows in the
     power spectrum of the counts of mantissas (Welch 1967). Bonferroni-corrected, over the most frequent
@@ -175,10 +177,10 @@ def chance_of_lattice(used: Words32) -> float:
     from scipy.special import gammaincc
 
     chances = [1.0]
-    for colour in range(3 if used.shape[1] > GEOMETRY else 0):
-        words = used[:, GEOMETRY + colour :: 3].ravel()
-        exponents = _exponents(words)
-        words = words[exponents == np.bincount(exponents).argmax()]
+    for colour in range(3 if harmonics.size else 0):
+        words = harmonics[:, colour::3].ravel()
+        binades = exponents(words)
+        words = words[binades == np.bincount(binades).argmax()]
         mantissas = (words >> np.uint32(1)) & np.uint32(_MANTISSAS - 1)  # the last bit is never written
         counts = np.bincount(mantissas, minlength=_MANTISSAS).astype(np.float32).reshape(-1, _WINDOW)
         powers = (np.abs(rfft(counts)[:, _SMOOTH:-1]) ** 2).sum(axis=0)
@@ -189,85 +191,59 @@ def chance_of_lattice(used: Words32) -> float:
     return float(min(chances))
 
 
-def frequent(words: Numbers, times: int) -> Numbers:
-    """[V] values that occur at least `times` times among `words` [...], in ascending order."""
-    ordered, further = np.sort(words, axis=None), times - 1
-    return np.unique(ordered[further:][ordered[further:] == ordered[: max(0, len(ordered) - further)]])
-
-
-def repeated(values: Words) -> Flags:
-    """Mask [N] of the values [N] that occur at least twice."""
-    return among(values, frequent(values, 2))
-
-
-def among(values: Numbers, ordered: Numbers) -> Flags:
-    """Mask [...] of the values [...] that are in `ordered`, in ascending order; faster than `np.isin`."""
-    if not len(ordered):
-        return np.zeros(values.shape, bool)
-    result: Flags = ordered[np.searchsorted(ordered, values).clip(max=len(ordered) - 1)] == values
-    return result
-
-
-def _exponents(words: Words32) -> Bytes:
-    """[...] the biased binary exponents."""
-    return (words >> np.uint32(23) & np.uint32(255)).astype(np.uint8)
-
-
-def _without_copies(gaussians: Gaussians, layout: Layout, ids: Bytes) -> Flags:
+def _without_coincidences(gaussians: Gaussians, layout: Layout, ids: Bytes) -> Flags:
     """Mask [N] of Gaussians without shared, frequent, nearly equal, saturated, nearly pruned, short and unit
     numbers."""
-    shared = [slice(0, 3), *([QUATS] if layout.quats else [])]
-    if layout.sh_degree:
-        shared += [slice(GEOMETRY + colour, GEOMETRY + 9, 3) for colour in range(3)]
-    keys = np.empty((len(shared) + 1, len(gaussians)), np.uint64)
+    groups, fine = layout.groups(gaussians), np.ones(len(gaussians), bool)
+    common = {name: frequent(words, _unlikely_copies(words.size)) for name, words in groups.items()}
+    shared = [groups[name] for name in (SCALES, QUATS) if name in groups]
+    shared += [groups[HARMONICS][:, colour:9:3] for colour in range(3 if layout.sh_degree else 0)]
+    keys = np.empty((len(shared) + 1, len(fine)), np.uint64)
     keys[-1] = ids.view("<u8")[:, 0]
-    common = [frequent(words, _unlikely_copies(words.size)) for words in map(words_of, groups_of(gaussians))]
-    fine = np.empty(len(gaussians), bool)
 
     def judge(start: int, stop: int) -> None:
-        used = used_words(gaussians[start:stop])
-        for key, columns in zip(keys, shared, strict=False):
-            key[start:stop] = row_hashes(used[:, columns] & ~LOW)
-        large, opacity = _exponents(used), used[:, _OPACITY]
-        good = (large > 0) & (large < 254)
-        good[:, _OPACITY] &= ~((opacity >= _SATURATED[0]) & (opacity < _SATURATED[1]))
-        good[:, _OPACITY] &= opacity | LOW != _PRUNED
-        for group, values in zip(_GROUPS.values(), common, strict=True):
-            good[:, group] &= ~among(used[:, group], values)
-        high = ((used & _MAGNITUDE) >> np.uint32(DEEPEST + 1)).astype(np.int32)
-        triples = np.delete(high, slice(3, GEOMETRY), axis=1).reshape(len(used), -1, 3)
-        near = np.abs(triples - triples[:, :, [1, 2, 0]]) <= 1
-        fine[start:stop] = good[:, layout.columns].all(axis=1) & ~near.any(axis=(1, 2))
-        fine[start:stop] &= (used[:, layout.columns] & LOW == 0).sum(axis=1) < _SHORT
-        if layout.quats:
-            fine[start:stop] &= np.abs(coarse_lengths(used[:, QUATS]) - 1) > UNIT_TOLERANCE
+        for key, words in zip(keys, shared, strict=False):
+            key[start:stop] = row_hashes(words[start:stop] & ~LOW)
+        good, short = fine[start:stop], np.zeros(stop - start, np.int64)
+        for name, every in groups.items():
+            words = every[start:stop]
+            large = exponents(words)
+            good &= ((large > 0) & (large < 254) & ~among(words, common[name])).all(axis=1)
+            short += (words & LOW == 0).sum(axis=1)
+            if name in (SCALES, HARMONICS):
+                high = ((words & _MAGNITUDE) >> np.uint32(DEEPEST + 1)).astype(np.int32)
+                threes = high.reshape(len(words), words.shape[1] // 3, 3)
+                good &= (np.abs(threes - threes[:, :, [1, 2, 0]]) > 1).all(axis=(1, 2))
+            elif name == QUATS:
+                good &= np.abs(coarse_lengths(words) - 1) > UNIT_TOLERANCE
+            elif name == OPACITIES:
+                saturated = (words >= _SATURATED[0]) & (words < _SATURATED[1])
+                good &= ~(saturated | (words | LOW == _PRUNED))[:, 0]
+        good &= short < _SHORT
 
-    in_blocks(judge, len(gaussians), BLOCK)
+    in_blocks(judge, len(fine), BLOCK)
     unique: Flags = ~np.logical_or.reduce(in_blocks(lambda index, _: repeated(keys[index]), len(keys), 1))
     return fine & unique
 
 
-def _large_enough(gaussians: Gaussians, layout: Layout, counted: Flags) -> Flags:
+def _without_small_even(gaussians: Gaussians, layout: Layout, counted: Flags) -> Flags:
     """Mask [N] of Gaussians without small even numbers, by the trailing zeros of those `counted` [N]."""
+    groups, fine = layout.groups(gaussians), np.ones(len(gaussians), bool)
 
     def count(start: int, stop: int) -> Integers:
-        used = used_words(gaussians[start:stop])
         own = counted[start:stop]
-        return np.stack([count_trailing_zeros(used[:, group], own) for group in _GROUPS.values()])
+        return np.stack([count_trailing_zeros(words[start:stop][own]) for words in groups.values()])
 
-    large = np.ones(len(gaussians), bool)
-    counts = np.sum(in_blocks(count, len(gaussians), BLOCK), axis=0)
-    least = [least_exponent(each, MAX_SEPARATION / len(_GROUPS)) for each in counts]
+    counts = np.sum(in_blocks(count, len(fine), BLOCK), axis=0)
+    least = [least_exponent(each, MAX_SEPARATION / len(ATTRIBUTES)) for each in counts]
 
     def compare(start: int, stop: int) -> None:
-        used = used_words(gaussians[start:stop])
-        for group, bound in zip(_GROUPS.values(), least, strict=True):
-            if layout.quats or group != QUATS:
-                values = used[:, group]
-                large[start:stop] &= ~((_exponents(values) < bound) & (values & 1 == 0)).any(axis=1)
+        for words, bound in zip(groups.values(), least, strict=True):
+            own = words[start:stop]
+            fine[start:stop] &= ~((exponents(own) < bound) & (own & 1 == 0)).any(axis=1)
 
-    in_blocks(compare, len(gaussians), BLOCK)
-    return large
+    in_blocks(compare, len(fine), BLOCK)
+    return fine
 
 
 def _unlikely_copies(count: int) -> int:

@@ -16,6 +16,7 @@ from keyss.core.arrays import Bytes, Doubles, Floats, Integers, Numbers, Words
 from keyss.core.errors import InputError, KeyssWarning, OutputError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.files.ply_table import OPACITY_LOGIT_BOUND
+from keyss.kernels.parallel import in_blocks
 
 # A compressed file of more Gaussians than SMALL_COUNT must have at least MIN_BYTES for each. Published models
 # take 7 and more, those of degree 3 10 and more (appended ones, which have no harmonics).
@@ -312,18 +313,24 @@ def morton_keys(positions: Floats | Doubles, within: Floats | Doubles) -> Words:
     """
     low, high = within.min(axis=0).astype(np.float64), within.max(axis=0).astype(np.float64)
     extent = np.where(high > low, high - low, 1.0)
-    cells = (((positions - low) / extent).clip(0, 1) * (2**_MORTON_BITS - 1)).astype(np.uint64)
-    # Spread the bits of each coordinate: two zeros between neighbours are the places of the other two.
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        cells = (cells | (cells << np.uint64(shift))) & np.uint64(mask)
-    keys: Words = np.bitwise_or.reduce(cells << np.arange(3, dtype=np.uint64), axis=1)
-    return keys
+
+    def keys(start: int, stop: int) -> Words:
+        # Spread the bits of each coordinate: two zeros between neighbours are the places of the other two.
+        cells = (((positions[start:stop] - low) / extent).clip(0, 1) * (2**_MORTON_BITS - 1)).astype(
+            np.uint64
+        )
+        for shift, mask in (
+            (32, 0x1F00000000FFFF),
+            (16, 0x1F0000FF0000FF),
+            (8, 0x100F00F00F00F00F),
+            (4, 0x10C30C30C30C30C3),
+            (2, 0x1249249249249249),
+        ):
+            cells = (cells | (cells << np.uint64(shift))) & np.uint64(mask)
+        places: Words = np.bitwise_or.reduce(cells << np.arange(3, dtype=np.uint64), axis=1)
+        return places
+
+    return np.concatenate([np.empty(0, np.uint64), *in_blocks(keys, len(positions), BLOCK)])
 
 
 def is_in_morton_order(means: Floats) -> bool:
