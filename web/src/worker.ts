@@ -3,7 +3,7 @@ import DERIVE from 'source:./derive.ts';
 import type { Reader } from './channels/container.ts';
 import { channelsOf } from './channels/opening.ts';
 import { InputError } from './core/errors.ts';
-import { buffersOf, type Gaussians, opacitiesAreBytes } from './core/gaussians.ts';
+import { buffersOf, type Gaussians } from './core/gaussians.ts';
 import { readModel } from './files/models.ts';
 import { fileOf, type HiddenFile, secretOf } from './hidden.ts';
 import { type Derive, deriveInWorker, roundRobin, sequential, startWorker } from './keys/keys.ts';
@@ -19,7 +19,6 @@ export interface Question {
 
 export interface Answer {
   readonly model?: Gaussians;
-  readonly wasDecoded?: boolean; // a .ply decoded from a compressed file, in which only `keyss reveal` finds secrets
   readonly foreign?: number; // Gaussians added to or changed in the published file
   readonly file?: HiddenFile;
   readonly elsewhere?: boolean; // only `keyss reveal` opens the payload
@@ -39,7 +38,7 @@ let prepared: Promise<Reader | null> = Promise.resolve(null);
 async function load(bytes: Uint8Array, name: string | undefined, tell: Tell): Promise<void> {
   const read = await readModel(bytes, name);
   const { codes, ...model } = read;
-  tell({ model, wasDecoded: !codes && opacitiesAreBytes(model) });
+  tell({ model });
   stego = model;
   // After the answer, so that the picture comes first. Without enough memory no key opens anything.
   prepared = new Promise((resolve) => setTimeout(resolve, 0)).then(() => channelsOf(read, false)).catch(() => null);

@@ -68,12 +68,6 @@ export function opacity(logit: number): number {
   return 1 / (1 + Math.exp(-logit));
 }
 
-/** Whether there are at most 256 different opacities, as in models decoded from other formats. */
-export function opacitiesAreBytes(gaussians: Gaussians): boolean {
-  const different = new Set<number>();
-  return gaussians.opacityLogits.every((logit) => different.add(logit).size <= 256);
-}
-
 /** The `count` most visible Gaussians by opacity and cross-section, in their order. */
 export function mostVisible(gaussians: Gaussians, count: number): Gaussians {
   const visibility = Float32Array.from({ length: gaussians.count }, (_, row) => {

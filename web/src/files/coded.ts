@@ -21,6 +21,12 @@ function logit(byte: number): number {
   return Math.max(-OPACITY_LOGIT_BOUND, Math.min(OPACITY_LOGIT_BOUND, value));
 }
 
+/** A quaternion of length 1; of zeros, that of no rotation, as in renderers. */
+export function unit(quat: readonly number[]): number[] {
+  const length = Math.sqrt(quat.reduce((sum, each) => sum + each * each, 0));
+  return length > 0 ? quat.map((each) => each / length) : [1, 0, 0, 0];
+}
+
 /** A unit quaternion from the index of the component left out, and the other three. */
 export function fromSmallestThree(largest: number, others: readonly number[]): number[] {
   const squares = others[0] * others[0] + others[1] * others[1] + others[2] * others[2];

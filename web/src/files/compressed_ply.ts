@@ -9,7 +9,7 @@ const ENDS = ['min', 'max'];
 const [AXES, SCALES, COLOURS] = [['x', 'y', 'z'], ['scale_x', 'scale_y', 'scale_z'], ['r', 'g', 'b']];
 
 /** Least and largest numbers of each chunk: [axis][min, max][C]. */
-type Bounds = Float64Array[][];
+export type Bounds = Float64Array[][];
 
 /** The values of a file, without harmonics. */
 export interface CompressedPlyCodes {
@@ -75,7 +75,7 @@ export function readCompressedPly(file: PlyFile): Gaussians & { readonly codes: 
 }
 
 /** The Gaussians, with harmonics of zero. */
-function dequantiseCompressedPly(codes: CompressedPlyCodes): Gaussians {
+export function dequantiseCompressedPly(codes: CompressedPlyCodes): Gaussians {
   const { count, shDegree, positions, scales, rotations, colours } = codes;
   const between = (bounds: Bounds, row: number, axis: number, share: number): number => {
     const [low, high] = bounds[axis].map((each) => each[Math.floor(row / CHUNK)]);

@@ -2,11 +2,11 @@
 import { bytesKey, viewOf } from '../core/bytes.ts';
 import { damaged, InputError } from '../core/errors.ts';
 import type { Gaussians } from '../core/gaussians.ts';
-import { gaussiansOf, SH_C0 } from './coded.ts';
-import { type CompressedPlyCodes, isCompressed, readCompressedPly } from './compressed_ply.ts';
+import { gaussiansOf, SH_C0, unit } from './coded.ts';
+import { type CompressedPlyCodes, dequantiseCompressedPly, isCompressed, readCompressedPly } from './compressed_ply.ts';
 import { openPly, readPly, withoutNonFinite } from './ply.ts';
-import { type Decode, readSog, type SogCodes } from './sog.ts';
-import { readSpz, type SpzCodes } from './spz.ts';
+import { type Decode, dequantiseSog, readSog, type SogCodes } from './sog.ts';
+import { dequantiseSpz, readSpz, type SpzCodes } from './spz.ts';
 
 /** The quantised values of formats that can carry secrets. */
 export type Codes = SpzCodes | SogCodes | CompressedPlyCodes;
@@ -29,6 +29,12 @@ export async function readModel(bytes: Uint8Array, name = '', decode?: Decode): 
   throw new InputError('This is not a file of a 3D Gaussian Splatting model that this page can read.');
 }
 
+/** The Gaussians of quantised values; of a compressed .ply without harmonics. */
+export function dequantised(codes: Codes): Gaussians {
+  if (codes.kind === 'spz') return dequantiseSpz(codes);
+  return codes.kind === 'sog' ? dequantiseSog(codes) : dequantiseCompressedPly(codes);
+}
+
 const MIN_SCALE = 2 ** -126;
 const ROW = 32; // bytes: mean and scale as floats; red, green, blue, opacity and quaternion as bytes
 
@@ -44,10 +50,6 @@ function readSplat(bytes: Uint8Array): Gaussians {
     },
     sh: (row, _, channel) => (bytes[ROW * row + 24 + channel] / 255 - 0.5) / SH_C0,
     opacity: (row) => bytes[ROW * row + 27],
-    quat: (row) => {
-      const quat = Array.from(bytes.subarray(ROW * row + 28, ROW * (row + 1)), (each) => each / 128 - 1);
-      const length = Math.sqrt(quat.reduce((sum, each) => sum + each * each, 0));
-      return length > 0 ? quat.map((each) => each / length) : [1, 0, 0, 0]; // as in renderers
-    },
+    quat: (row) => unit(Array.from(bytes.subarray(ROW * row + 28, ROW * (row + 1)), (each) => each / 128 - 1)),
   }));
 }

@@ -73,7 +73,7 @@ async function parse(bytes: Uint8Array, decode: Decode): Promise<SogCodes> {
 }
 
 /** Raises InputError for an impossible rotation. */
-function dequantiseSog(codes: SogCodes): Gaussians {
+export function dequantiseSog(codes: SogCodes): Gaussians {
   const { count, mins, maxs, positions, quats, scaleBook, scales, colourBook, colours, labels, harmonicBook, palette } = codes;
   const rest = coefficients(codes.shDegree) - 1;
   return gaussiansOf(count, codes.shDegree, {

@@ -8,7 +8,8 @@ import { fromSmallestThree, gaussiansOf, holds, mostHeld } from './coded.ts';
 const [LEGACY_BYTES, HEADER_BYTES] = [16, 32];
 const MAX_EXTENSION_BYTES = 1 << 20;
 const [MAX_UNPACKED, GAUSSIAN_BYTES] = [2 ** 31, 65];
-const MAGNITUDE = 511;
+export const [NEGATIVE, MAGNITUDE] = [512, 511]; // of a component of a rotation
+export const MAX_FRACTIONAL_BITS = 24;
 // Signs of the harmonics of degrees 1 to 3 under (x, y, z) -> (x, -y, -z): SPZ has y up, a .ply y down.
 const SH_SIGNS = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1];
 
@@ -38,7 +39,7 @@ export async function readSpz(bytes: Uint8Array): Promise<Gaussians & { readonly
 
 /** A component of a rotation: -511 to 511. */
 export function rotationPart(code: number): number {
-  return (code & 512 ? -1 : 1) * (code & MAGNITUDE);
+  return (code & NEGATIVE ? -1 : 1) * (code & MAGNITUDE);
 }
 
 function header(bytes: Uint8Array, versions: number[], size: number): Header & { sizes: number[] } {
@@ -47,7 +48,7 @@ function header(bytes: Uint8Array, versions: number[], size: number): Header & {
   const [version, count] = [view.getUint32(4, true), view.getUint32(8, true)];
   const [shDegree, fractionalBits] = [bytes[12], bytes[13]];
   if (!versions.includes(version)) throw new InputError('This SPZ is of a version that cannot be read.');
-  if (!holds(size, count) || shDegree > 3 || fractionalBits > 24) throw damaged();
+  if (!holds(size, count) || shDegree > 3 || fractionalBits > MAX_FRACTIONAL_BITS) throw damaged();
   const rotation = version === 2 ? 3 : 4;
   const sizes = [9, 1, 3, 3, rotation, 3 * (coefficients(shDegree) - 1)].map((each) => each * count);
   if (sizes.reduce((sum, each) => sum + each, 0) > MAX_UNPACKED) throw damaged();
@@ -106,7 +107,7 @@ function codesOf({ sizes, ...header }: Header & { sizes: number[] }, section: (s
   return { kind: 'spz', ...header, positions, alphas, colours, scales, largest, rotations, harmonics };
 }
 
-function dequantiseSpz(codes: SpzCodes): Gaussians {
+export function dequantiseSpz(codes: SpzCodes): Gaussians {
   const { count, version, shDegree, fractionalBits, positions, alphas, colours, scales, largest, rotations, harmonics } = codes;
   const rest = coefficients(shDegree) - 1;
   const part = (code: number): number =>

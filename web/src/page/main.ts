@@ -19,8 +19,6 @@ const SEARCHING = 'Nothing yet. Searching more thoroughly …';
 const STOPPED = 'Search stopped: nothing found so far.';
 const NOTHING = 'This key opens nothing: it may be wrong, this file may hold no secret, or the file was changed; '
   + 'check the key and ask for the original file.';
-const ELSEWHERE = 'This key opens nothing on this page, which cannot read secrets in models that were once compressed, '
-  + 'like this one: try keyss reveal.';
 const INTERRUPTED = 'The browser interrupted graphics. The picture comes back by itself; if not, reload the page.';
 
 /** Asks a worker, one question at a time. */
@@ -60,7 +58,6 @@ class Opener {
 class Page {
   private name = 'model';
   private published: Gaussians | null = null;
-  private wasDecoded = false;
   private secret: Gaussians | null = null;
   private readonly reader = new Opener((share) => this.showProgress(share));
   private readonly searcher = new Opener((share) => this.showProgress(share)); // of the slow channels, which new keys interrupt
@@ -133,11 +130,10 @@ class Page {
     const work = this.startWork();
     this.say('Reading …');
     page.problem.textContent = this.viewer ? '' : NO_WEBGL;
-    const { model, wasDecoded, error } = await this.reader.ask({ bytes, name }, [bytes.buffer]);
+    const { model, error } = await this.reader.ask({ bytes, name }, [bytes.buffer]);
     if (work !== this.work) return;
     if (model === undefined) return this.fail(error ?? 'This file cannot be read.');
     [this.name, this.published] = [(this.work === 1 && params.title) || (page.main.dataset.title ?? name), model];
-    this.wasDecoded = wasDecoded ?? false;
     this.hideSecret();
     page.open.disabled = page.key.disabled = false;
     page.facts.textContent = `${this.name}\n${count(model.count)} Gaussians, SH degree ${model.shDegree}`;
@@ -175,7 +171,7 @@ class Page {
       const news = this.show(answer);
       if (said && !news) return;
       said += news;
-      this.say(said || (search === 'quick' ? SEARCHING : answer.stopped ? STOPPED : this.wasDecoded ? ELSEWHERE : NOTHING));
+      this.say(said || (search === 'quick' ? SEARCHING : answer.stopped ? STOPPED : NOTHING));
       await this.settle();
       if (work !== this.work) return;
     }

@@ -17,6 +17,7 @@ import {
 import { EXACT_BYTES, exactForeign, ID_BYTES } from '../foreign.ts';
 import type { Codewords, Shards } from '../reed_solomon.ts';
 import { atDepth, DEEPEST, DEPTHS, fieldsOf, gaussianIds, LEAST, lowBits, lowWidth, saltOf, salts } from './bits.ts';
+import { decodedLevels } from './decoded.ts';
 import { BLOCK_BYTES, lastBits, type Levels, levelsOf, modelHash, readBlocks } from './fields.ts';
 import { isTagged, isWhole, message, parameterPads, shardBytes, shardsOf, type Table } from './shards.ts';
 
@@ -30,9 +31,10 @@ const [MAX_LENGTH, MAX_CODEWORDS] = [1 << 10, 1 << 14]; // shards of one codewor
 export abstract class LsbReader implements Reader {
   protected constructor(private readonly salts: readonly Uint8Array[]) {}
 
-  /** The reader of the quantised values of a file, else of low bits; null without capacity. */
+  /** The reader of the quantised values of a file, its own or that it was decoded from, else of low bits; null without capacity. */
   static async of(model: ReadModel): Promise<LsbReader | null> {
-    return model.codes ? BlockReader.ofCodes(levelsOf(model.codes)) : LowBitsReader.ofModel(model);
+    const levels = model.codes ? levelsOf(model.codes) : decodedLevels(model);
+    return levels ? BlockReader.ofLevels(levels) : LowBitsReader.ofModel(model);
   }
 
   get derivations(): number {
@@ -122,7 +124,7 @@ class BlockReader extends LsbReader {
     super(salts);
   }
 
-  static ofCodes(levels: Levels): BlockReader | null {
+  static ofLevels(levels: Levels): BlockReader | null {
     const bits = lastBits(levels);
     if (bits.length < MIN_BLOCKS * 8 * BLOCK_BYTES || bits.length > MAX_BITS) return null;
     const low = readBlocks(bits);
