@@ -31,6 +31,7 @@ from channels.lsb import quantised  # noqa: E402
 from channels.lsb.trained_like import trained_like  # noqa: E402
 from files.formats.examples import model_of, random_compressed, random_sog, random_spz  # noqa: E402
 from keyss.channels import LOW_BITS, SUFFIXES, Payload, channel_for, in_counted_order, last_bits, open_payload  # noqa: E402
+from keyss.channels.lsb.decoded import Decoded  # noqa: E402
 from keyss.channels.lsb.fields import _log2  # noqa: E402
 from keyss.core import Gaussians, Similarity  # noqa: E402
 from keyss.files import read_model, write_model  # noqa: E402
@@ -148,9 +149,11 @@ def write_coded(suffix: str) -> None:
 
 
 def write_decoded(suffix: str) -> None:
-    """A .ply decoded from codes, with a secret."""
+    """A .ply decoded from codes, with a secret; some quaternions have another sign, some are not exact."""
     codes = quantised.FORMATS[suffix].of(quantised.model_of(1500, 21, 0))
     model = codes.dequantise()
+    model.quats[::10] *= -1
+    model.quats[5::20] += 0.1
     payload = HiddenFile("a note.txt", b"Written at night, read at noon.\n").payload()
     stego = (
         channel_for("unchanged", cover=model)
@@ -181,17 +184,21 @@ def write_extremes() -> None:
 def write_counted() -> None:
     """The bits of slots in the quantised values of this folder's files."""
     bits = {}
-    for path in sorted([*FOLDER.glob("published*"), *FOLDER.glob("coded*"), *FOLDER.glob("extreme*")]):
-        if path.suffix != ".json" and isinstance(model := read_model(path), CodedGaussians):
-            bits[path.name] = carrier_bits(model)
+    for start in ("coded", "decoded", "extreme", "published"):
+        for path in sorted(FOLDER.glob(f"{start}*")):
+            model = None if path.suffix == ".json" else read_model(path)
+            if isinstance(model, CodedGaussians) or (model and Decoded.of(model)):
+                bits[path.name] = carrier_bits(model)
     numbers = [0.0, 1.0, -3.0, 0.75, 1e-5, 6.5e4, 5e-324, -1e-310, 2.0**-1022, 1.7e308, 2.0**-14 * 1.0001]
     logs = {repr(number): float(_log2(np.array([number]))[0]) for number in numbers}
     (FOLDER / "counted.json").write_text(json.dumps({"bits": bits, "log2": logs}, indent=1) + "\n")
 
 
-def carrier_bits(model: CodedGaussians) -> dict[str, Any]:
-    """Number and SHA-256 of the last bits of all levels."""
-    bits = last_bits(in_counted_order(model.codes)[2])
+def carrier_bits(model: Gaussians) -> dict[str, Any]:
+    """Number and SHA-256 of the last bits of all levels of a file, or of the one that a model was decoded from."""
+    decoded = Decoded.of(model)
+    codes, exact = (decoded.codes, decoded.exact) if decoded else (model.codes, None)  # type: ignore[attr-defined]
+    bits = last_bits(in_counted_order(codes, exact)[2])
     return {"count": len(bits), "sha256": hashlib.sha256(bits.tobytes()).hexdigest()}
 
 

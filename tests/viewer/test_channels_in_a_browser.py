@@ -10,7 +10,9 @@ import pytest
 
 import keyss
 from keyss.channels import SUFFIXES, channel_for
+from keyss.channels.names import Publish
 from keyss.files import read_model, write_model
+from keyss.files.formats.spz import SpzCodes
 from keyss.methods import HiddenFile, embed_models
 from keyss.viewer import export_html
 from lab.lifelike import lifelike
@@ -20,7 +22,7 @@ pytestmark = IN_CHROMIUM
 
 KEYS = ("the first key", "ein zweiter Schlüssel")
 PUBLISHED = {"ply": "ply"} | {suffix.removeprefix("."): publish for publish, suffix in SUFFIXES.items()}
-OTHERS = (*list(PUBLISHED)[1:], "appended.ply", "appended.spz", "appended.sog")
+OTHERS = (*list(PUBLISHED)[1:], "decoded.ply", "appended.ply", "appended.spz", "appended.sog")
 
 
 def keys_of(kind: str) -> tuple[str, ...]:
@@ -34,11 +36,14 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]
 
     @cache
     def stego(kind: str) -> Path:
-        format = PUBLISHED.get(kind)
-        channel = channel_for("unchanged" if format else "converted", format=format)  # type: ignore[arg-type]
+        cover, format = bright_model(4000, 0), PUBLISHED.get(kind)
+        if kind == "decoded.ply":
+            cover = SpzCodes.of(cover).dequantise()
+        publish: Publish = "converted" if kind.startswith("appended") else "unchanged"
+        channel = channel_for(publish, format=format, cover=cover)  # type: ignore[arg-type]
         keys, secrets = keys_of(kind), [bright_model(100, seed).with_sh_degree(1) for seed in (1, 2)]
         model = embed_models(
-            channel.prepare(bright_model(4000, 0)), keys, secrets[: len(keys)], entropy=bytes(32)
+            channel.prepare(cover), keys, secrets[: len(keys)], entropy=bytes(32)
         ).gaussians
         write_model(folder / f"stego.{kind}", model)
         return folder / f"stego.{kind}"

@@ -1,8 +1,8 @@
 import { expect, test } from 'vitest';
+import { decodedLevels } from '../src/channels/lsb/decoded.ts';
 import { lastBits, levelsOf, log2 } from '../src/channels/lsb/fields.ts';
 import { LsbReader } from '../src/channels/lsb/reading.ts';
 import { sortingOrder } from '../src/core/words.ts';
-import type { Codes } from '../src/files/models.ts';
 import { digest, jsonVector, modelOf } from './vectors.ts';
 
 interface Counted {
@@ -11,14 +11,11 @@ interface Counted {
 }
 
 const COUNTED = jsonVector<Counted>('counted.json');
-const FILES = ['coded.spz', 'coded.sog', 'coded.compressed.ply'];
-
-async function codesOf(name: string): Promise<Codes> {
-  return (await modelOf(name)).codes!;
-}
+const FILES = ['coded.spz', 'coded.sog', 'coded.compressed.ply', 'decoded-spz.ply', 'decoded-sog.ply', 'decoded-compressed.ply'];
 
 test.each(Object.entries(COUNTED.bits))('carrying bits of %s match Python', async (name, { count, sha256 }) => {
-  const bits = lastBits(levelsOf(await codesOf(name)));
+  const model = await modelOf(name);
+  const bits = lastBits(model.codes ? levelsOf(model.codes) : decodedLevels(model)!);
   expect([bits.length, digest(bits)]).toEqual([count, sha256]);
 });
 
@@ -43,6 +40,10 @@ test.each(FILES)('wrong keys open nothing in %s with as many derivations', async
   };
   expect(await (await LsbReader.of(await modelOf(name)))!.open('any', derive)).toBeNull();
   expect(salts.length).toBe(1);
+});
+
+test.each(['carried.ply', 'appended.ply', 'published.splat'])('%s was not decoded from quantised values', async (name) => {
+  expect(decodedLevels(await modelOf(name))).toBeNull();
 });
 
 test('codes without capacity have no reader', async () => {

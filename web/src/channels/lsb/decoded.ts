@@ -26,15 +26,19 @@ export function decodedLevels(model: Gaussians): Levels | null {
     const exact = exactRows(model, dequantised(codes));
     if (exact.reduce((sum, each) => sum + each, 0) / model.count < MIN_EXACT) continue;
     const { fields, rows } = levelsOf(codes);
-    const [colours, opacities] = [model.sh, model.opacityLogits].map((each) => new Uint32Array(each.buffer, each.byteOffset, each.length));
-    const width = 3 * coefficients(model.shDegree);
+    const colour = byRow(bitPatterns(model.sh), 3 * coefficients(model.shDegree));
+    const opacity = bitPatterns(model.opacityLogits);
     return {
       rows,
       fields: fields.map(({ level, bits }) => ({ level, bits: (row) => (exact[row] ? bits(row) : 0) })),
-      unwritten: (row, part) => (part < 3 ? colours[width * row + part] : opacities[row]),
+      unwritten: (row, part) => (part < 3 ? colour(row, part) : opacity[row]),
     };
   }
   return null;
+}
+
+function bitPatterns(numbers: Float32Array): Uint32Array {
+  return new Uint32Array(numbers.buffer, numbers.byteOffset, numbers.length);
 }
 
 /** Ascending different numbers; null if there are more than CODES. */
@@ -68,7 +72,9 @@ function spzCodes({ count, means, logScales, quats }: Gaussians): SpzCodes | nul
     const [w, x, y, z] = unitQuat(quats, row);
     const [index, others] = smallestThree([x, -y, -z, w]);
     largest[row] = index;
-    rotations.set(others.map((each) => rounded(Math.abs(each) * (MAGNITUDE / Math.sqrt(0.5)), MAGNITUDE) | (each < 0 ? NEGATIVE : 0)), 3 * row);
+    rotations.set(others.map((each) => {
+      return rounded(Math.abs(each) * (MAGNITUDE / Math.sqrt(0.5)), MAGNITUDE) | (each < 0 ? NEGATIVE : 0);
+    }), 3 * row);
   }
   return {
     kind: 'spz', version: 3, count, shDegree: 0, fractionalBits, largest, rotations,
@@ -90,10 +96,11 @@ function fractionalBitsOf(means: Float32Array): number | null {
 /** Without harmonics, which carry nothing; null if numbers are too many for a codebook. */
 function sogCodes({ count, shDegree, means, logScales, quats, opacityLogits, sh }: Gaussians): SogCodes | null {
   const scaleBook = different(logScales);
+  if (scaleBook === null) return null;
   const constant = byRow(sh, 3 * coefficients(shDegree));
-  const colourBook = scaleBook && different(Float32Array.from({ length: 3 * count }, (_, at) => constant(Math.floor(at / 3), at % 3)));
-  if (!scaleBook || !colourBook) return null;
-  const [scaleCodes, colourCodes] = [scaleBook, colourBook].map((book) => new Map(Array.from(book, (each, code) => [each, code])));
+  const colourBook = different(Float32Array.from({ length: 3 * count }, (_, at) => constant(Math.floor(at / 3), at % 3)));
+  if (colourBook === null) return null;
+  const [scaleCodes, colourCodes] = [scaleBook, colourBook].map((book) => new Map([...book].map((each, code) => [each, code])));
   const logs = Float64Array.from(means, (each) => Math.sign(each) * Math.log1p(Math.abs(each)));
   const [mins, maxs] = [Math.min, Math.max].map((end) => AXES.map((axis) => {
     let bound = logs[axis];
@@ -144,8 +151,9 @@ function compressedPlyCodes({ count, means, logScales, quats }: Gaussians): Comp
 function boundsOf(values: Float32Array, limit: number): Bounds {
   const chunks = Math.ceil(values.length / 3 / CHUNK);
   return AXES.map((axis) => [Math.min, Math.max].map((end) => Float64Array.from({ length: chunks }, (_, chunk) => {
+    const last = Math.min(values.length, 3 * CHUNK * (chunk + 1));
     let bound = values[3 * CHUNK * chunk + axis];
-    for (let at = 3 * CHUNK * chunk; at < Math.min(values.length, 3 * CHUNK * (chunk + 1)); at += 3) bound = end(bound, values[at + axis]);
+    for (let at = 3 * CHUNK * chunk + axis; at < last; at += 3) bound = end(bound, values[at]);
     return Math.min(Math.max(bound, -limit), limit);
   })));
 }

@@ -31,7 +31,7 @@ const [MAX_LENGTH, MAX_CODEWORDS] = [1 << 10, 1 << 14]; // shards of one codewor
 export abstract class LsbReader implements Reader {
   protected constructor(private readonly salts: readonly Uint8Array[]) {}
 
-  /** The reader of the quantised values of a file, its own or that it was decoded from, else of low bits; null without capacity. */
+  /** The reader of quantised values of the model's file or the one it was decoded from, else of low bits; null without capacity. */
   static async of(model: ReadModel): Promise<LsbReader | null> {
     const levels = model.codes ? levelsOf(model.codes) : decodedLevels(model);
     return levels ? BlockReader.ofLevels(levels) : LowBitsReader.ofModel(model);
