@@ -80,7 +80,7 @@ def test_capacity(keyss: Run, tmp_path: Path) -> None:
     )
     for words in ("--format spz: ", "--format sog: ", "--format compressed-ply: ", "--channel colours: "):
         assert words in out
-    assert "--publish converted: any secret" in out
+    assert "--publish converted: 5,999,820 bytes" in out
 
 
 def test_capacity_is_of_a_model(keyss: Run, workspace: Path) -> None:

@@ -48,7 +48,7 @@ def run_all_commands(keyss: Run) -> None:
         assert f"--seed {metrics['seed']}" in run(f"info {name}").splitlines()[0]
         found = json.loads(run(f"info {name}.ply --json"))
         assert found["gaussians"] == len(read_model(Path(f"{name}.ply"))) > 0
-    assert run("render hidden.ply --cameras b -o images --split all") == "images: 4 images\n"
+    assert run("render hidden.ply --cameras b -o images --split all").startswith("images: 4 images; ")
     assert len(list(Path("images").glob("*.png"))) == 4
     run("audit hidden --key-file key.txt --only parameters --controls 2 --device cpu")
     run("info hidden --json")

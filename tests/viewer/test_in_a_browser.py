@@ -116,14 +116,18 @@ def in_place_of_thorough_searches(tab: Visit, answer: str) -> None:
     )
 
 
+def wait_until_said(tab: Visit, start: str) -> None:
+    status = "start => document.getElementById('status').textContent.startsWith(start)"
+    tab.page.wait_for_function(status, arg=start)
+
+
 def test_no_key_waits_for_the_search_of_another(tab: Visit, page_file: Path) -> None:
     in_place_of_thorough_searches(tab, "")  # they never end
     tab.goto(page_file.as_uri())
     for key in ("another key", *KEYS):
         tab.page.fill("#key", key)
         tab.page.press("#key", "Enter")
-        said = "The key reveals" if key in KEYS else "Nothing found yet. Searching"
-        tab.page.wait_for_function(f"() => document.getElementById('status').textContent.startsWith('{said}')")
+        wait_until_said(tab, "The key reveals" if key in KEYS else "Nothing yet. Searching")
         searching = "silent" if key in KEYS else "thorough"
         tab.page.wait_for_selector(f"main[data-searching={searching}]")
         tab.page.evaluate("document.getElementById('status').textContent = ''")
@@ -141,10 +145,10 @@ def test_wrong_keys_are_explained(tab: Visit, page_file: Path, tmp_path: Path) -
             tab.settle()
         tab.page.fill("#key", "another key")
         tab.page.press("#key", "Enter")
-        tab.page.wait_for_function("() => document.getElementById('status').textContent.startsWith('This key')")
+        wait_until_said(tab, "This key")
         said = tab.page.locator("[role=status]").inner_text()
         elsewhere = "this page, which cannot read secrets in models that were once compressed"
-        assert ((elsewhere in said) == (file is not None and file.suffix == ".ply")), said
+        assert (elsewhere in said) == (file is not None and file.suffix == ".ply"), said
         assert re.fullmatch(r"[^.]+\.", said)
         if elsewhere not in said:
             assert all(each in said for each in ("wrong", "no secret", "changed", "check the key"))

@@ -6,7 +6,7 @@ import { InputError } from './core/errors.ts';
 import { buffersOf, type Gaussians, opacitiesAreBytes } from './core/gaussians.ts';
 import { readModel } from './files/models.ts';
 import { fileOf, type HiddenFile, secretOf } from './hidden.ts';
-import { deriveInWorker, roundRobin, sequential, startWorker } from './keys/keys.ts';
+import { type Derive, deriveInWorker, roundRobin, sequential, startWorker } from './keys/keys.ts';
 
 /** A file to read; a key to try on it; or a key and a model to search thoroughly. Answers go to the port that comes with it. */
 export interface Question {
@@ -14,6 +14,7 @@ export interface Question {
   readonly name?: string; // some formats have no magic bytes
   readonly key?: string;
   readonly model?: Gaussians; // of SH degree 0, for the slow channels
+  readonly silent?: boolean; // nobody waits: leaves the other processors to the picture
 }
 
 export interface Answer {
@@ -31,7 +32,7 @@ type Tell = (answer: Answer, moved?: Transferable[]) => void;
 
 // Derivation dominates the time of an attempt, so several run in parallel, at 64 MiB each.
 const DERIVERS = Math.max(1, Math.min(4, navigator.hardwareConcurrency || 2));
-const derive = roundRobin(Array.from({ length: DERIVERS }, () => sequential(deriveInWorker(startWorker(DERIVE)))));
+let derive: Derive | null = null;
 let stego: Gaussians | null = null;
 let prepared: Promise<Reader | null> = Promise.resolve(null);
 
@@ -44,7 +45,11 @@ async function load(bytes: Uint8Array, name: string | undefined, tell: Tell): Pr
   prepared = new Promise((resolve) => setTimeout(resolve, 0)).then(() => channelsOf(read, false)).catch(() => null);
 }
 
-async function unlock(key: string, tell: Tell): Promise<void> {
+function derivers(count: number): Derive {
+  return roundRobin(Array.from({ length: count }, () => sequential(deriveInWorker(startWorker(DERIVE)))));
+}
+
+async function unlock(key: string, derive: Derive, tell: Tell): Promise<void> {
   const [reader, model] = [await prepared, stego];
   let done = 0;
   const payload = await reader?.open(key, async (own, salt) => {
@@ -62,12 +67,13 @@ async function unlock(key: string, tell: Tell): Promise<void> {
 self.onmessage = async ({ data, ports: [port] }: MessageEvent<Question>) => {
   const tell: Tell = (answer, moved = []) => port.postMessage(answer, moved);
   try {
+    derive ??= derivers(data.silent ? 1 : DERIVERS);
     if (data.model) {
       stego = data.model;
       prepared = channelsOf(data.model, true);
     }
     if (data.bytes) await load(data.bytes, data.name, tell);
-    else await unlock(data.key ?? '', tell);
+    else await unlock(data.key ?? '', derive, tell);
   } catch (error) {
     const message = error instanceof InputError ? error.message : 'This file cannot be read.';
     // Errors of a key are indistinguishable from a wrong key.

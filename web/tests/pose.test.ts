@@ -1,9 +1,8 @@
 import { expect, test } from 'vitest';
 import { emptyGaussians, type Gaussians } from '../src/core/gaussians.ts';
-import { dot } from '../src/core/similarity.ts';
+import { add, difference, dot, length, type Vector } from '../src/core/vectors.ts';
 import {
-  add, transferPose, axes, difference, FIELD_OF_VIEW, firstPose, length, poseOfHash, poseToHash, orbit, UPS, upName,
-  verticalFov, type Vector,
+  transferPose, axes, FIELD_OF_VIEW, firstPose, poseOfHash, poseToHash, orbit, UPS, upName, verticalFov,
 } from '../src/page/pose.ts';
 
 /** 4,000 opaque Gaussians in a box around a middle, or on its floor across an axis. */

@@ -68,7 +68,7 @@ class Details:
         Literal["appended", "colours"] | None,
         optional(
             "{appended,colours}",
-            "With --publish converted: appended Gaussians hold everything, but are visible in the file; "
+            "With --publish converted: appended Gaussians hold 6 MB, but are visible in the file; "
             "colours hold less and show less.",
             "appended",
         ),

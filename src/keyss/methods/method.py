@@ -133,7 +133,7 @@ class MethodOptions:
     # but converted if the secrets do not fit into the cover unchanged.
     publish: Publish | None = None
     format: Format | None = None  # of an unchanged model; None: the cover's
-    # Of a converted model: appended Gaussians hold any secret but are visible in the file; colours are less
+    # Of a converted model: appended Gaussians hold 6 MB but are visible in the file; colours are less
     # visible and hold little.
     channel: ConvertedChannel = "appended"
 
@@ -167,7 +167,8 @@ class MethodOptions:
                 raise
             if self.publish or self.format:
                 cure = '`channel="appended"`' if channel.survives else '`publish="converted"`'
-                raise UsageError(f"{refusal}; {cure} has room for any secret") from refusal
+                room = APPENDED.estimate_capacity(0, 0).bytes
+                raise UsageError(f"{refusal}; {cure} has room for {room:,} bytes") from refusal
             warnings.warn(_FALLBACK.format(refusal), KeyssWarning, stacklevel=2)
         return use(APPENDED)
 

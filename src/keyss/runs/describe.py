@@ -191,7 +191,7 @@ def _read_model(path: Path) -> Gaussians:
 
 def _capacities(model: Gaussians) -> Iterator[str]:
     """What a model can hide in each format and channel."""
-    from keyss.channels import channel_for
+    from keyss.channels import APPENDED, channel_for
 
     ways: list[tuple[str, Any]] = [
         *((f"--format {name}", ("unchanged", "appended", name)) for name in get_args(Format)),
@@ -207,7 +207,7 @@ def _capacities(model: Gaussians) -> Iterator[str]:
             f"{room.bytes // each:,} Gaussians of SH degree {n}" for n, each in _BYTES_PER_GAUSSIAN.items()
         )
         yield f"{flags}: {room.bytes:,} bytes, a model of about {' or '.join(sizes)}"
-    yield "--publish converted: any secret, as the file grows"
+    yield f"--publish converted: {APPENDED.estimate_capacity(0, 0).bytes:,} bytes; the file grows"
 
 
 def _round(values: Iterable[Any]) -> tuple[float, ...]:

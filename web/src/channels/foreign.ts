@@ -2,6 +2,7 @@
 import { viewOf } from '../core/bytes.ts';
 import { coefficients, type Gaussians, opacity } from '../core/gaussians.ts';
 import { movedPoint, type Similarity } from '../core/similarity.ts';
+import { vectorAt } from '../core/vectors.ts';
 import { sortingOrder } from '../core/words.ts';
 import { encryptBlocks } from '../keys/aes.ts';
 import { expand } from '../keys/keys.ts';
@@ -9,34 +10,33 @@ import { expand } from '../keys/keys.ts';
 export const ID_BYTES = 16;
 
 /**
- * The share, 0 to 1, of foreign Gaussians among those with `ids` [N, 16], by the Bloom filter `own`; equal IDs count once.
- * `among`: places that each Gaussian hashes to, or for all of them the number of the filter's Gaussians. 1 if less than a share
- * `gone` of the filter's sample, rounded down, is there.
+ * The share, 0 to 1, of foreign Gaussians among those with `ids` [N, 16], by the first `bits` of a Bloom filter; equal IDs
+ * count once. `places`: how many a Gaussian may hash to. 1 if less than a share `gone` of the filter's sample, rounded down,
+ * is there.
  */
 function foreignShare(
-  secret: Uint8Array, ids: Uint8Array, own: Uint8Array, among: number | readonly number[], gone = 0,
+  secret: Uint8Array, ids: Uint8Array, filter: Uint8Array, bits: number, places: (row: number) => number, gone = 0,
 ): number {
-  const kept = 8 * own.length;
-  const isUnset = (place: number): boolean => ((own[place >>> 3] >>> (place & 7)) & 1) === 0;
-  const bits = typeof among === 'number' ? Math.min(kept, among) : kept;
-  const unset = Array.from({ length: bits }, (_, place) => place).filter(isUnset).length;
+  const isUnset = (place: number): boolean => ((filter[place >>> 3] >>> (place & 7)) & 1) === 0;
+  const unset = [...Array(bits).keys()].filter(isUnset).length;
   const hashed = viewOf(encryptBlocks(expand(secret, 'bloom'), ids));
   const sampled = new Map<number, number>(); // the place of each different ID
   for (let row = 0; row < ids.length / ID_BYTES; row++) {
     const [low, high] = [hashed.getUint32(ID_BYTES * row, true), hashed.getUint32(ID_BYTES * row + 4, true)];
-    const place = low % Math.max(1, typeof among === 'number' ? among : among[row]);
-    if (place < kept) sampled.set(low * 2 ** 21 + (high >>> 11), place);
+    const place = low % Math.max(1, places(row));
+    if (place < bits) sampled.set(low * 2 ** 21 + (high >>> 11), place);
   }
   if (sampled.size < Math.floor(gone * (bits - unset))) return 1;
-  const found = [...sampled.values()].filter(isUnset).length;
-  return Math.min(1, found / Math.max(1e-9, (sampled.size * unset) / Math.max(1, bits)));
+  const foreign = [...sampled.values()].filter(isUnset).length;
+  return Math.min(1, foreign / Math.max(1e-9, (sampled.size * unset) / Math.max(1, bits)));
 }
 
 export const EXACT_BYTES = 4 + 32;
 
 /** About how many of the Gaussians with `ids` [N, 16] are foreign, by the record of exact IDs. */
 export function exactForeign(record: Uint8Array, secret: Uint8Array, ids: Uint8Array): number {
-  const share = foreignShare(secret, ids, record.subarray(4), viewOf(record).getUint32(0, true));
+  const [count, filter] = [viewOf(record).getUint32(0, true), record.subarray(4)];
+  const share = foreignShare(secret, ids, filter, Math.min(8 * filter.length, count), () => count);
   return Math.ceil((share * ids.length) / ID_BYTES);
 }
 
@@ -64,7 +64,7 @@ export function coarseForeign(record: Uint8Array, secret: Uint8Array, model: Gau
   const rows = numbersOf(model, toOwn);
   const [steps, offsets] = stepsOf(rows, secret);
   const ids = new Int8Array(ID_BYTES * rows.length);
-  const among: number[] = [];
+  const places: number[] = [];
   for (const [row, numbers] of rows.entries()) {
     const bins = steps[row].map(Math.floor);
     // A format may have moved it from another bin.
@@ -72,13 +72,13 @@ export function coarseForeign(record: Uint8Array, secret: Uint8Array, model: Gau
     const middles = bins.map((bin, at) => (bin + 0.5 - offsets[row][at]) * BINS[at]);
     const [, b, c] = middles.slice(3, 6).sort((x, y) => x - y);
     const size = Math.exp(b + c) * Math.max(0.02, Math.min(1, middles[6])) / area;
-    ids.set(bins, ID_BYTES * among.length);
-    among.push(Math.max(8 * BLOOM_BYTES, Math.round(2 / (1 / count + size))));
+    ids.set(bins, ID_BYTES * places.length);
+    places.push(Math.max(8 * BLOOM_BYTES, Math.round(2 / (1 / count + size))));
   }
-  const own = new Uint8Array(ids.buffer, 0, ID_BYTES * among.length);
+  const known = new Uint8Array(ids.buffer, 0, ID_BYTES * places.length);
   const visible = model.count - faint;
-  const found = foreignShare(secret, own, record.subarray(BLOOM), among, GONE);
-  let sure = found > LEAST_SHARE ? Math.round(found * visible) : 0;
+  const share = foreignShare(secret, known, record.subarray(BLOOM), 8 * BLOOM_BYTES, (row) => places[row], GONE);
+  let sure = share > LEAST_SHARE ? Math.round(share * visible) : 0;
   const outside = rows.filter(isOutside).length;
   if (outside > outsideBefore + LEAST_SHARE * visible) sure = Math.max(sure, outside - outsideBefore);
   return sure + (faint > MORE * before ? faint - before : 0); // a hundred faint ones in one place are visible
@@ -90,10 +90,8 @@ function numbersOf(model: Gaussians, toOwn: Similarity): number[][] {
   const rows: number[][] = [];
   for (let row = 0; row < model.count; row++) {
     const numbers = [
-      ...movedPoint(toOwn, model.means.subarray(3 * row, 3 * row + 3)),
-      ...Array.from(model.logScales.subarray(3 * row, 3 * row + 3), (each) => each + larger),
-      opacity(model.opacityLogits[row]),
-      ...model.sh.subarray(width * row, width * row + 3),
+      ...movedPoint(toOwn, vectorAt(model.means, row)), ...vectorAt(model.logScales, row).map((each) => each + larger),
+      opacity(model.opacityLogits[row]), ...model.sh.subarray(width * row, width * row + 3),
     ];
     if (!(numbers.every(Number.isFinite) && numbers[6] > VISIBLE)) continue;
     rows.push(numbers.map((each, at) => Math.max(LOW[at], Math.min(HIGH[at], each))));
@@ -110,8 +108,8 @@ function stepsOf(rows: readonly number[][], secret: Uint8Array): [steps: number[
   });
   const borders = encryptBlocks(expand(secret, 'borders'), new Uint8Array(blocks.buffer));
   const offsets = rows.map((_, row) => {
-    const own = borders.subarray(ID_BYTES * row, ID_BYTES * row + BINS.length - POSITIONS);
-    return [...first, ...Array.from(own, offsetOf)];
+    const others = borders.subarray(ID_BYTES * row, ID_BYTES * row + BINS.length - POSITIONS);
+    return [...first, ...Array.from(others, offsetOf)];
   });
   return [rows.map((numbers, row) => numbers.map((each, at) => each / BINS[at] + offsets[row][at])), offsets];
 }
@@ -136,16 +134,13 @@ export function copies(model: Gaussians): number {
   const width = 3 * coefficients(model.shDegree);
   const rows = [...Array(model.count).keys()].filter((row) => opacity(model.opacityLogits[row]) > COPIED);
   const numbers = new Float32Array(4 * rows.length);
-  rows.forEach((row, at) => {
-    numbers.set(model.means.subarray(3 * row, 3 * row + 3), 4 * at);
-    numbers[4 * at + 3] = model.sh[width * row];
-  });
+  rows.forEach((row, at) => numbers.set([...vectorAt(model.means, row), model.sh[width * row]], 4 * at));
   const words = new Uint32Array(numbers.map((each) => each + 0).buffer); // no negative zeros
   const order = sortingOrder(words, 4);
-  let found = 0;
+  let count = 0;
   for (let at = 1; at < order.length; at++) {
     const [a, b] = [4 * order[at - 1], 4 * order[at]];
-    if ([0, 1, 2, 3].every((word) => words[a + word] === words[b + word])) found++;
+    if ([0, 1, 2, 3].every((word) => words[a + word] === words[b + word])) count++;
   }
-  return found > MAX_COPIES * rows.length ? found : 0;
+  return count > MAX_COPIES * rows.length ? count : 0;
 }

@@ -49,7 +49,7 @@ export interface Shards {
 }
 
 /** Shards [n], null if lost, of one codeword. */
-type OwnShards = (Uint8Array | null)[];
+type Codeword = (Uint8Array | null)[];
 
 const [LOST, CONTRADICTORY] = [-1, -2];
 
@@ -63,24 +63,23 @@ export function decoded({ count, n, k, width }: Codewords, { numbers, data: shar
     else if (other >= 0 && !isEqual(shards, other * width, row * width, width)) rows[number] = CONTRADICTORY;
   }
   const data = new Uint8Array(count * k * width);
-  const incomplete: { own: OwnShards; codeword: number }[] = [];
-  for (let codeword = 0; codeword < count; codeword++) {
-    const own = Array.from({ length: n }, (_, each) => rows[each * count + codeword]).map((row) =>
-      row < 0 ? null : shards.subarray(row * width, (row + 1) * width),
-    );
-    if (errors) dropErrors(own, k);
-    if (own.reduce((sum, each) => sum + (each ? 1 : 0), 0) < k) throw tooMuchLost();
-    for (let row = 0; row < k; row++) {
-      const shard = own[row];
-      if (shard) data.set(shard, (row * count + codeword) * width);
-    }
-    if (own.indexOf(null) >= 0 && own.indexOf(null) < k) incomplete.push({ own, codeword });
+  const incomplete: { codeword: Codeword; number: number }[] = [];
+  for (let number = 0; number < count; number++) {
+    const codeword = Array.from({ length: n }, (_, shard) => {
+      const row = rows[shard * count + number];
+      return row < 0 ? null : shards.subarray(row * width, (row + 1) * width);
+    });
+    if (errors) dropErrors(codeword, k);
+    if (codeword.filter(Boolean).length < k) throw tooMuchLost();
+    const needed = codeword.slice(0, k);
+    needed.forEach((shard, row) => shard && data.set(shard, (row * count + number) * width));
+    if (needed.includes(null)) incomplete.push({ codeword, number });
   }
   const atOnce = Math.max(1, Math.floor((2 * COLUMNS) / width));
   for (let first = 0; first < incomplete.length; first += atOnce) {
     const some = incomplete.slice(first, first + atOnce);
-    restore(some.map(({ own }) => own), k, width / 2, (at, row, shard) => {
-      data.set(shard, (row * count + some[at].codeword) * width);
+    restore(some.map(({ codeword }) => codeword), k, width / 2, (at, row, shard) => {
+      data.set(shard, (row * count + some[at].number) * width);
     });
   }
   return data;
@@ -93,7 +92,7 @@ function isEqual(bytes: Uint8Array, a: number, b: number, width: number): boolea
 
 /** Calls `put` with every lost one of the first k shards of some codewords of `columns` symbols. */
 function restore(
-  codewords: OwnShards[], k: number, columns: number, put: (codeword: number, row: number, shard: Uint8Array) => void,
+  codewords: Codeword[], k: number, columns: number, put: (codeword: number, row: number, shard: Uint8Array) => void,
 ): void {
   const size = sizeFor(codewords[0].length);
   const width = columns * codewords.length;
@@ -203,7 +202,7 @@ function differentiate(work: Uint16Array, size: number, width: number): void {
 }
 
 /** Sets shards to null that do not belong to the codeword of the majority; all if there are too many errors. */
-function dropErrors(shards: OwnShards, k: number): void {
+function dropErrors(shards: Codeword, k: number): void {
   const rows = shards.flatMap((shard, row) => (shard ? [row] : []));
   if (rows.length <= k) return;
   const products = differences(sizeFor(shards.length), (row) => Boolean(shards[row]));
@@ -233,9 +232,9 @@ function dropErrors(shards: OwnShards, k: number): void {
 
 /** Coefficients, 1 first, of the shortest linear recurrence of a sequence (Berlekamp-Massey). */
 function recurrence(sums: number[]): number[] {
-  let [found, before, length, since, scale] = [[1], [1], 0, 1, 1];
+  let [coefficients, before, length, since, scale] = [[1], [1], 0, 1, 1];
   for (let index = 0; index < sums.length; index++) {
-    const discrepancy = found
+    const discrepancy = coefficients
       .slice(0, length + 1)
       .reduce((sum, each, back) => sum ^ product(each, sums[index - back]), 0);
     if (discrepancy === 0) {
@@ -244,10 +243,10 @@ function recurrence(sums: number[]): number[] {
     }
     const factor = product(discrepancy, POWERS[ORDER - LOGARITHMS[scale]]);
     const shifted = [...new Array<number>(since).fill(0), ...before.map((each) => product(factor, each))];
-    const kept = found;
-    found = Array.from({ length: Math.max(found.length, shifted.length) }, (_, at) => (kept[at] ?? 0) ^ (shifted[at] ?? 0));
+    const kept = coefficients;
+    coefficients = Array.from({ length: Math.max(coefficients.length, shifted.length) }, (_, at) => (kept[at] ?? 0) ^ (shifted[at] ?? 0));
     if (2 * length <= index) [length, before, scale, since] = [index + 1 - length, kept, discrepancy, 1];
     else since++;
   }
-  return found;
+  return coefficients;
 }

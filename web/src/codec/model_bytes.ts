@@ -44,19 +44,19 @@ export function decodeModel(data: Uint8Array, carriers: number): Gaussians {
   const blocks = Math.ceil(count / BLOCK);
   let start = HEAD_BYTES + 4 * blocks;
   if (start > data.length) throw damaged();
-  const found = emptyGaussians(count, shDegree);
+  const model = emptyGaussians(count, shDegree);
   for (let block = 0; block < blocks; block++) {
     const end = start + view.getUint32(HEAD_BYTES + 4 * block, true);
     if (end > data.length) throw damaged();
-    decodeBlock(data.subarray(start, end), head, found, block * BLOCK);
+    decodeBlock(data.subarray(start, end), head, model, block * BLOCK);
     start = end;
   }
   if (start !== data.length) throw damaged();
-  return found;
+  return model;
 }
 
-/** Decodes a block into the rows of `found` from `first` on. */
-function decodeBlock(data: Uint8Array, head: Head, found: Gaussians, first: number): void {
+/** Decodes a block into the rows of `model` from `first` on. */
+function decodeBlock(data: Uint8Array, head: Head, model: Gaussians, first: number): void {
   const { centres, typical } = head;
   const k = coefficients(head.shDegree);
   const [shares, groups] = [[...SHARES], [...GROUPS]];
@@ -70,25 +70,25 @@ function decodeBlock(data: Uint8Array, head: Head, found: Gaussians, first: numb
   const own = new Float64Array(3);
   for (let row = 0, to = first; row < count; row++, to++) {
     for (let axis = 0; axis < 3; axis++) {
-      found.means[3 * to + axis] = table[axis][row] * means + centres[axis];
-      found.logScales[3 * to + axis] = own[axis] = table[3 + axis][row] * scales + centres[3];
+      model.means[3 * to + axis] = table[axis][row] * means + centres[axis];
+      model.logScales[3 * to + axis] = own[axis] = table[3 + axis][row] * scales + centres[3];
     }
-    const logit = (found.opacityLogits[to] = table[6][row] * opacity + centres[4]);
+    const logit = (model.opacityLogits[to] = table[6][row] * opacity + centres[4]);
     const [a, b, c] = own;
     const [larger, smaller] = a > b ? [a, b] : [b, a];
     const size = c > larger ? c + larger : larger + Math.max(smaller, c); // of the two longest axes
     const finer = Math.floor((size + 2 * Math.min(logit, 0) - typical) * PER_OCTAVE + 0.5);
     const factor = FACTORS[Math.min(Math.max(finer, -FINER), FINER) + FINER];
     const [x, y, z] = [table[10][row] * (quats * factor), table[11][row] * (quats * factor), table[12][row] * (quats * factor)];
-    found.quats[4 * to] = Math.sqrt(Math.max(1 - (x * x + y * y + z * z), LEAST_W));
-    found.quats[4 * to + 1] = x;
-    found.quats[4 * to + 2] = y;
-    found.quats[4 * to + 3] = z;
+    model.quats[4 * to] = Math.sqrt(Math.max(1 - (x * x + y * y + z * z), LEAST_W));
+    model.quats[4 * to + 1] = x;
+    model.quats[4 * to + 2] = y;
+    model.quats[4 * to + 3] = z;
     const different = colours * DIFFERENCE;
-    putColours(found.sh, 3 * k * to, table[7][row] * colours, table[8][row] * different, table[9][row] * different);
+    putColours(model.sh, 3 * k * to, table[7][row] * colours, table[8][row] * different, table[9][row] * different);
     const step = harmonics * factor;
     for (let each = 1, from = 13; each < k; each++, from += 3) {
-      putColours(found.sh, 3 * (k * to + each), table[from][row] * step, table[from + 1][row] * step, table[from + 2][row] * step);
+      putColours(model.sh, 3 * (k * to + each), table[from][row] * step, table[from + 1][row] * step, table[from + 2][row] * step);
     }
   }
 }

@@ -28,9 +28,9 @@ export function viewOf(bytes: Uint8Array): DataView {
 export function rowsOf<T extends Uint8Array | Int16Array | Float32Array | Float64Array>(
   table: T, rows: ArrayLike<number>, width: number,
 ): T {
-  const found = new (table.constructor as new (size: number) => T)(rows.length * width);
-  for (let to = 0; to < rows.length; to++) found.set(table.subarray(rows[to] * width, (rows[to] + 1) * width), to * width);
-  return found;
+  const selection = new (table.constructor as new (size: number) => T)(rows.length * width);
+  for (let to = 0; to < rows.length; to++) selection.set(table.subarray(rows[to] * width, (rows[to] + 1) * width), to * width);
+  return selection;
 }
 
 /** Linearly interpolated quantile; 0 for no values. */

@@ -39,22 +39,22 @@ export function buffersOf(gaussians: Gaussians): ArrayBuffer[] {
 
 /** A copy with another SH degree: truncated, or padded with zeros. */
 export function withDegree(gaussians: Gaussians, shDegree: number): Gaussians {
-  const found = emptyGaussians(gaussians.count, shDegree);
-  for (const column of FIXED) found[column].set(gaussians[column]);
+  const copy = emptyGaussians(gaussians.count, shDegree);
+  for (const column of FIXED) copy[column].set(gaussians[column]);
   const [from, to] = [3 * coefficients(gaussians.shDegree), 3 * coefficients(shDegree)];
   for (let row = 0; row < gaussians.count; row++) {
-    for (let at = 0; at < Math.min(from, to); at++) found.sh[row * to + at] = gaussians.sh[row * from + at];
+    for (let at = 0; at < Math.min(from, to); at++) copy.sh[row * to + at] = gaussians.sh[row * from + at];
   }
-  return found;
+  return copy;
 }
 
 /** The Gaussians of these rows, in this order. */
 export function selected(gaussians: Gaussians, rows: ArrayLike<number>): Gaussians {
-  const found = emptyGaussians(rows.length, gaussians.shDegree);
+  const selection = emptyGaussians(rows.length, gaussians.shDegree);
   for (const column of COLUMNS) {
-    found[column].set(rowsOf(gaussians[column], rows, gaussians[column].length / Math.max(1, gaussians.count)));
+    selection[column].set(rowsOf(gaussians[column], rows, gaussians[column].length / Math.max(1, gaussians.count)));
   }
-  return found;
+  return selection;
 }
 
 /** The Gaussians for which `keep` is true, in their order. */

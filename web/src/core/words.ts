@@ -27,13 +27,13 @@ export function sortingOrder(words: Uint32Array, width = 2): Uint32Array {
 
 /** [N] number of words equal to each, itself included; `order`: their sorting order. */
 export function multiplicities(words: Words, order = sortingOrder(words)): Uint32Array {
-  const found = new Uint32Array(order.length);
+  const counts = new Uint32Array(order.length);
   for (let start = 0, end = 0; start < order.length; start = end) {
     const [low, high] = [words[2 * order[start]], words[2 * order[start] + 1]];
     while (end < order.length && words[2 * order[end]] === low && words[2 * order[end] + 1] === high) end++;
-    for (let at = start; at < end; at++) found[order[at]] = end - start;
+    for (let at = start; at < end; at++) counts[order[at]] = end - start;
   }
-  return found;
+  return counts;
 }
 
 /** Replaces the word at `at` by its hash, the finaliser of splitmix64 (Steele et al. 2014); no secret is involved. */

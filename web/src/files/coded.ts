@@ -17,8 +17,8 @@ export function holds(size: number, count: number): boolean {
 
 /** Opacity logit of `byte` 255ths; finite for 0 and 255 too. */
 function logit(byte: number): number {
-  const found = Math.log(byte / 255) - Math.log1p(-byte / 255);
-  return Math.max(-OPACITY_LOGIT_BOUND, Math.min(OPACITY_LOGIT_BOUND, found));
+  const value = Math.log(byte / 255) - Math.log1p(-byte / 255);
+  return Math.max(-OPACITY_LOGIT_BOUND, Math.min(OPACITY_LOGIT_BOUND, value));
 }
 
 /** A unit quaternion from the index of the component left out, and the other three. */

@@ -94,31 +94,31 @@ export function readPly(file: PlyFile): Gaussians {
   const names = new Set(vertex.properties.map(({ name }) => name)); // rows without properties take no bytes
   if (!plyColumns(shDegree).every(({ name }) => names.has(name))) throw noModel();
   if (vertex.count === 0) throw new InputError(`This file holds no Gaussians${CURE}`);
-  const found = emptyGaussians(vertex.count, shDegree);
-  for (let first = 0; first < found.count; first += ROWS) {
+  const model = emptyGaussians(vertex.count, shDegree);
+  for (let first = 0; first < model.count; first += ROWS) {
     for (const { name, to, offset } of plyColumns(shDegree)) {
-      const width = found[to].length / found.count;
-      column(file, vertex, name, first, ROWS)!.forEach((value, row) => (found[to][(first + row) * width + offset] = value));
+      const width = model[to].length / model.count;
+      column(file, vertex, name, first, ROWS)!.forEach((value, row) => (model[to][(first + row) * width + offset] = value));
     }
   }
-  found.opacityLogits.forEach((logit, row) => {
-    if (Math.abs(logit) === Infinity) found.opacityLogits[row] = Math.sign(logit) * OPACITY_LOGIT_BOUND;
+  model.opacityLogits.forEach((logit, row) => {
+    if (Math.abs(logit) === Infinity) model.opacityLogits[row] = Math.sign(logit) * OPACITY_LOGIT_BOUND;
   });
-  found.logScales.forEach((logScale, at) => {
-    if (logScale === -Infinity) found.logScales[at] = LEAST_LOG_SCALE;
+  model.logScales.forEach((logScale, at) => {
+    if (logScale === -Infinity) model.logScales[at] = LEAST_LOG_SCALE;
   });
-  return withoutNonFinite(found);
+  return withoutNonFinite(model);
 }
 
 /** The Gaussians with finite values only. Raises InputError if there are none. */
 export function withoutNonFinite(gaussians: Gaussians): Gaussians {
   if (isFinite(gaussians)) return gaussians;
   const widths = COLUMNS.map((each) => [gaussians[each], gaussians[each].length / gaussians.count] as const);
-  const found = where(gaussians, (row) =>
+  const finite = where(gaussians, (row) =>
     widths.every(([values, width]) => values.subarray(row * width, (row + 1) * width).every(Number.isFinite)),
   );
-  if (found.count === 0) throw notFinite();
-  return found;
+  if (finite.count === 0) throw notFinite();
+  return finite;
 }
 
 /** Raises InputError for values that are not finite. */

@@ -38,8 +38,8 @@ function fill(byte: number, substitute: number): void {
 
 /** Every 16 bytes through AES-256: a pseudorandom function of blocks, not a mode of operation. */
 export function encryptBlocks(key: Uint8Array, blocks: Uint8Array): Uint8Array {
-  const found = blocks.slice(); // aligned
-  const words = new Uint32Array(found.buffer, 0, found.length >> 2); // of little-endian machines, as all are
+  const encrypted = blocks.slice(); // aligned
+  const words = new Uint32Array(encrypted.buffer, 0, encrypted.length >> 2); // of little-endian machines, as all are
   const keys = unsafe.expandKeyLE(key);
   for (let at = 0; at < words.length; at += 4) {
     let [a, b, c, d] = [words[at] ^ keys[0], words[at + 1] ^ keys[1], words[at + 2] ^ keys[2], words[at + 3] ^ keys[3]];
@@ -57,7 +57,7 @@ export function encryptBlocks(key: Uint8Array, blocks: Uint8Array): Uint8Array {
     words[at + 2] = last(c, d, a, b) ^ keys[4 * ROUNDS + 2];
     words[at + 3] = last(d, a, b, c) ^ keys[4 * ROUNDS + 3];
   }
-  return found;
+  return encrypted;
 }
 
 function last(a: number, b: number, c: number, d: number): number {

@@ -1,5 +1,6 @@
 /** Camera controls by mouse, touch and keyboard. */
-import { add, axes, difference, length, type Pose, orbit, type Vector } from './pose.ts';
+import { add, combined, difference, distance, length } from '../core/vectors.ts';
+import { axes, type Pose, orbit } from './pose.ts';
 
 const TURN = 0.005; // radians per pixel
 const KEY_TURN = 0.08; // radians per press of an arrow key
@@ -114,18 +115,16 @@ export class Controls {
   private zoom(factor: number): void {
     const { eye, target } = this.pose;
     const offset = difference(eye, target);
-    const distance = length(offset);
-    const bounded = Math.min(Math.max(distance * factor, NEAREST), FURTHEST);
-    this.setPose({ ...this.pose, eye: add(target, offset, bounded / distance) });
+    const bounded = Math.min(Math.max(length(offset) * factor, NEAREST), FURTHEST);
+    this.setPose({ ...this.pose, eye: add(target, offset, bounded / length(offset)) });
   }
 
   /** Moves by shares of the distance to the target. */
   private move(right: number, down: number, forward: number): void {
     const { eye, target } = this.pose;
     const directions = axes(this.pose);
-    const distance = length(difference(target, eye));
-    let step: Vector = add([0, 0, 0], directions.right, right * distance);
-    step = add(add(step, directions.down, down * distance), directions.forward, forward * distance);
-    this.setPose({ ...this.pose, eye: add(eye, step), target: add(target, step) });
+    const step = combined([right, down, forward], [directions.right, directions.down, directions.forward]);
+    const far = distance(eye, target);
+    this.setPose({ ...this.pose, eye: add(eye, step, far), target: add(target, step, far) });
   }
 }

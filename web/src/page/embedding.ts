@@ -2,14 +2,14 @@
 import { readAll } from '../core/bytes.ts';
 import { page } from './panel.ts';
 
-const found = new URLSearchParams(location.search);
+const query = new URLSearchParams(location.search);
 
 export const params = {
-  file: found.get('file'),
-  title: found.get('title'),
-  poster: found.get('poster'), // shown until the model is drawn
-  autorotate: found.has('autorotate'),
-  panel: found.has('key-field') ? 'key' : found.has('noui') ? 'none' : 'all',
+  file: query.get('file'),
+  title: query.get('title'),
+  poster: query.get('poster'), // shown until the model is drawn
+  autorotate: query.has('autorotate'),
+  panel: query.has('key-field') ? 'key' : query.has('noui') ? 'none' : 'all',
 };
 
 export type EmbedEvent =

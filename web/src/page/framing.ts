@@ -1,7 +1,8 @@
 /** What a picture of a model should show: its subject, and which way is up. Counterpart of `keyss.rendering.framing`. */
 import { type Gaussians, opacity } from '../core/gaussians.ts';
-import { cross } from '../core/similarity.ts';
-import type { Vector } from './pose.ts';
+import {
+  combined, cross, difference, distance, dot, type Quaternion, rotated, scaled, unit, type Vector, vectorAt,
+} from '../core/vectors.ts';
 
 const SAMPLE = 4_000; // Gaussians that are looked at
 const [SHRINK, STEPS] = [0.87, 60]; // ratio of radii, and their number: down to 1/4,000
@@ -17,6 +18,7 @@ const [LOWEST, HIGHEST, ROLLS] = [-10, 55, [-8, 0, 8]];
 const [STEP, EXACT] = [5, 6]; // degrees between those directions; from the axes of other programs
 const [TILTED_FLOOR, AXIS_FLOOR] = [0.095, 0.15]; // share of the Gaussians, by size, in a floor
 const CLEARLY = 1.3; // ratio of the floor across an axis to that across a tilted direction
+const AXES: readonly Vector[] = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
 const BELOW = 0.05; // radii by which the middle of a model is below a floor across y where y is up
 
 /** Gaussians of a model, sampled. */
@@ -44,11 +46,10 @@ export interface Frame {
 export function frameOf(model: Gaussians): Frame {
   const step = Math.max(1, Math.ceil(model.count / SAMPLE));
   const rows = Array.from({ length: Math.ceil(model.count / step) }, (_, index) => index * step);
-  const three = (values: Float32Array, row: number): Vector => [values[3 * row], values[3 * row + 1], values[3 * row + 2]];
-  const means = rows.map((row) => three(model.means, row));
+  const means = rows.map((row) => vectorAt(model.means, row));
   let weights = rows.map((row) => opacity(model.opacityLogits[row]) || 0);
   if (!weights.some(Boolean)) weights = weights.map(() => 1);
-  const ordered = rows.map((row) => three(model.logScales, row).map(Math.exp).sort((a, b) => a - b));
+  const ordered = rows.map((row) => vectorAt(model.logScales, row).map(Math.exp).sort((a, b) => a - b));
   const sizes = ordered.map(([, b, c]) => Math.sqrt(b * c));
   let { middle, radius } = densest(means, weights);
   let inside = within(means, middle, radius);
@@ -63,7 +64,7 @@ export function frameOf(model: Gaussians): Frame {
   const large = quantile(sizes, sizes.map(() => 1), 0.95);
   const extents = sizes.map((size, at) => weights[at] * Math.min(size, large));
   const floors = new Floors(
-    inside.map((at) => means[at].map((each, axis) => (each - middle[axis]) / radius) as unknown as Vector),
+    inside.map((at) => scaled(difference(means[at], middle), 1 / radius)),
     inside.map((at) => normal(model, rows[at])),
     inside.map((at) => extents[at]),
   );
@@ -112,14 +113,12 @@ class Floors {
     const total = Math.max(sum(this.extents), 1e-30);
     let best: Floor = { share: 0, above: 0, direction: directions[0] };
     for (const direction of directions) {
-      const [x, y, z] = direction;
       const slabs = new Float64Array(SLABS);
       let middle = 0;
       for (let at = 0; at < this.extents.length; at++) {
-        const [offset, normal] = [this.offsets[at], this.normals[at]];
-        const height = x * offset[0] + y * offset[1] + z * offset[2];
+        const height = dot(direction, this.offsets[at]);
         middle += height * this.extents[at];
-        if (Math.abs(x * normal[0] + y * normal[1] + z * normal[2]) <= ALIGNED) continue;
+        if (Math.abs(dot(direction, this.normals[at])) <= ALIGNED) continue;
         slabs[Math.max(0, Math.min(SLABS - 1, Math.trunc(((height / REACH + 1) * SLABS) / 2)))] += this.extents[at];
       }
       const pairs = slabs.slice(1).map((area, at) => area + slabs[at]);
@@ -152,31 +151,23 @@ function ofCaptures(): Vector[] {
 
 /** Directions within `degrees` of an axis other than x, which is the first, evenly spread. */
 function cap(axis: Vector, degrees: number, count: number): Vector[] {
-  const across = cross(axis, [1, 0, 0]);
-  const side = across.map((each) => each / Math.hypot(...across));
-  const other = cross(axis, side);
+  const side = unit(cross(axis, [1, 0, 0]));
+  const basis = [axis, side, cross(axis, side)];
   return Array.from({ length: count }, (_, index) => {
     const along = 1 - ((1 - Math.cos((degrees * Math.PI) / 180)) * index) / count;
     const turn = index * Math.PI * (3 - Math.sqrt(5));
     const aside = Math.sqrt(1 - along * along);
-    const [a, b] = [aside * Math.cos(turn), aside * Math.sin(turn)];
-    return axis.map((each, at) => along * each + a * side[at] + b * other[at]) as unknown as Vector;
+    return combined([along, aside * Math.cos(turn), aside * Math.sin(turn)], basis);
   });
 }
 
 /** The shortest axis of a Gaussian. */
 function normal(model: Gaussians, row: number): Vector {
   const quat = [...model.quats.subarray(4 * row, 4 * row + 4)];
-  const [w, x, y, z] = quat.map((each) => each / Math.max(Math.hypot(...quat), 1e-12));
-  const scales = [...model.logScales.subarray(3 * row, 3 * row + 3)];
-  return ([
-    [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
-    [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
-    [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
-  ] as Vector[])[scales.indexOf(Math.min(...scales))];
+  const rotation = quat.map((each) => each / Math.max(Math.hypot(...quat), 1e-12)) as unknown as Quaternion;
+  const scales = vectorAt(model.logScales, row);
+  return rotated(rotation, AXES[scales.indexOf(Math.min(...scales))]);
 }
-
-export const distance = (a: Vector, b: Vector): number => Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
 
 /** Rows of the places closer to `middle` than `radius`. */
 function within(means: readonly Vector[], middle: Vector, radius: number): number[] {

@@ -15,7 +15,7 @@ const ADDRESS_AFTER = 400; // ms after the last movement
 const MAX_BYTES = 2 ** 31;
 const HAS_SCREEN_KEYBOARD = window.matchMedia('(pointer: coarse)'); // which covers the picture
 const NO_WEBGL = "Your browser doesn't support WebGL 2, which is needed to show the model.";
-const SEARCHING = 'Nothing found yet. Searching more thoroughly …';
+const SEARCHING = 'Nothing yet. Searching more thoroughly …';
 const STOPPED = 'Search stopped: nothing found so far.';
 const NOTHING = 'This key opens nothing: it may be wrong, this file may hold no secret, or the file was changed; '
   + 'check the key and ask for the original file.';
@@ -130,11 +130,11 @@ class Page {
   }
 
   private async load(bytes: Uint8Array, name: string): Promise<void> {
-    const own = this.startWork();
+    const work = this.startWork();
     this.say('Reading …');
     page.problem.textContent = this.viewer ? '' : NO_WEBGL;
     const { model, wasDecoded, error } = await this.reader.ask({ bytes, name }, [bytes.buffer]);
-    if (own !== this.work) return;
+    if (work !== this.work) return;
     if (model === undefined) return this.fail(error ?? 'This file cannot be read.');
     [this.name, this.published] = [(this.work === 1 && params.title) || (page.main.dataset.title ?? name), model];
     this.wasDecoded = wasDecoded ?? false;
@@ -158,7 +158,7 @@ class Page {
   private async unlock(): Promise<void> {
     const [key, published] = [page.key.value, this.published];
     if (!key || published === null || page.open.disabled) return;
-    const own = this.startWork();
+    const work = this.startWork();
     if (HAS_SCREEN_KEYBOARD.matches) page.key.blur();
     this.controls.rotate(false);
     this.writeAddress(); // before the key opens anything
@@ -167,28 +167,28 @@ class Page {
     for (const search of ['quick', 'thorough'] as const) {
       this.showSearch(said ? 'silent' : search);
       if (!said) delete page.main.dataset.picture;
-      const answer = await (search === 'quick' ? this.reader.ask({ key }) : this.searchThoroughly(key, published));
-      if (own !== this.work) return;
+      const answer = await (search === 'quick' ? this.reader.ask({ key }) : this.searchThoroughly(key, published, Boolean(said)));
+      if (work !== this.work) return;
       this.showSearch('');
       if (search === 'quick') notifyParent({ event: 'key-tried' });
       else this.searcher.stop(); // frees its memory
-      const found = this.found(answer);
-      if (said && !found) return;
-      said += found;
+      const news = this.show(answer);
+      if (said && !news) return;
+      said += news;
       this.say(said || (search === 'quick' ? SEARCHING : answer.stopped ? STOPPED : this.wasDecoded ? ELSEWHERE : NOTHING));
       await this.settle();
-      if (own !== this.work) return;
+      if (work !== this.work) return;
     }
   }
 
   /** In a worker of its own, so that the next key need not wait. */
-  private searchThoroughly(key: string, published: Gaussians): Promise<Answer> {
+  private searchThoroughly(key: string, published: Gaussians, silent: boolean): Promise<Answer> {
     const model = withDegree(published, 0);
-    return this.searcher.ask({ key, model }, buffersOf(model));
+    return this.searcher.ask({ key, model, silent }, buffersOf(model));
   }
 
   /** Shows what a key opened; returns sentences about it, empty for nothing. */
-  private found({ model, file, elsewhere, foreign }: Answer): string {
+  private show({ model, file, elsewhere, foreign }: Answer): string {
     if (file || model) notifyParent({ event: 'opened', kind: file ? 'file' : 'model' });
     const sentences = [
       file && this.offer(file), model && this.reveal(model),
@@ -288,9 +288,9 @@ class Page {
     const aspect = page.picture.clientWidth / Math.max(1, page.picture.clientHeight) || 1;
     const isOwn = model === this.published;
     const given = this.homes.get(model) ?? (isOwn ? poseOfHash(pose ?? '') : null);
-    const found = given ?? firstPose(model, aspect, isOwn ? UPS[up ?? ''] : undefined);
-    this.homes.set(model, found);
-    return found;
+    const home = given ?? firstPose(model, aspect, isOwn ? UPS[up ?? ''] : undefined);
+    this.homes.set(model, home);
+    return home;
   }
 
   private sameView(pose: Pose, from: Gaussians, to: Gaussians): Pose {

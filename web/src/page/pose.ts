@@ -1,9 +1,7 @@
 /** Camera poses: eye, target and up vector. */
 import type { Gaussians } from '../core/gaussians.ts';
-import { cross, dot } from '../core/similarity.ts';
-import { distance, type Frame, frameOf, quantile } from './framing.ts';
-
-export type Vector = readonly [number, number, number];
+import { add, combined, cross, difference, distance, dot, length, unit, type Vector } from '../core/vectors.ts';
+import { type Frame, frameOf, quantile } from './framing.ts';
 
 export interface Pose {
   readonly eye: Vector;
@@ -25,15 +23,6 @@ const LITTLE = 1.15; // times the distance
 const MARGIN = 0.9; // of half the picture
 const STEEPEST = (85 * Math.PI) / 180;
 
-export const add = (a: Vector, b: Vector, scale = 1): Vector => [
-  a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2],
-];
-export const difference = (a: Vector, b: Vector): Vector => add(a, b, -1);
-export const length = (a: Vector): number => Math.hypot(...a);
-const unit = (a: Vector): Vector => add([0, 0, 0], a, 1 / Math.max(length(a), 1e-12));
-const combined = (shares: readonly number[], [a, b, c]: readonly Vector[]): Vector =>
-  add(add(add([0, 0, 0], a, shares[0]), b, shares[1]), c, shares[2]);
-
 /** Unit vectors of the camera: right, down (OpenCV's y) and forward. */
 export function axes({ eye, target, up }: Pose): { right: Vector; down: Vector; forward: Vector } {
   const forward = unit(difference(target, eye));
@@ -51,13 +40,13 @@ export function firstPose(model: Gaussians, aspect: number, up?: Vector): Pose {
   const front = Math.abs(above[1]) > 0.5 ? [0, 0, Math.sign(above[1])] as Vector : [0, -1, 0] as Vector;
   const level = unit(add(front, above, -dot(front, above)));
   const side = cross(above, level);
-  const found = HEIGHTS.flatMap((height, step) => Array.from({ length: DIRECTIONS }, (_, index) => {
+  const candidates = HEIGHTS.flatMap((height, step) => Array.from({ length: DIRECTIONS }, (_, index) => {
     const turn = (2 * Math.PI * index) / DIRECTIONS;
     const flat = Math.sqrt(1 - height * height);
     const away = combined([flat * Math.cos(turn), flat * Math.sin(turn), height], [level, side, above]);
     return { away, cost: hidden(frame, away) + UNUSUAL * (1 - Math.cos(turn)) + HIGHER * step };
   }));
-  return framing(frame, aspect, found.reduce((best, each) => (each.cost < best.cost ? each : best)).away, above);
+  return framing(frame, aspect, candidates.reduce((best, each) => (each.cost < best.cost ? each : best)).away, above);
 }
 
 /** The subject from the direction `away`, as large as it fits. */
@@ -138,14 +127,14 @@ export function poseToHash(pose: Pose): string {
 }
 
 export function poseOfHash(hash: string): Pose | null {
-  const found = new URLSearchParams(hash.replace(/^#/, ''));
+  const values = new URLSearchParams(hash.replace(/^#/, ''));
   const vector = (name: string): Vector | null => {
-    const numbers = (found.get(name) ?? '').split(',').map((each) => (each.trim() ? Number(each) : NaN));
+    const numbers = (values.get(name) ?? '').split(',').map((each) => (each.trim() ? Number(each) : NaN));
     return numbers.length === 3 && numbers.every((each) => Math.abs(each) < 1e6) ? (numbers as unknown as Vector) : null;
   };
   const [eye, target, asked] = [vector('eye'), vector('target'), vector('up')];
-  const up = asked && length(asked) > 1e-3 ? unit(asked) : (UPS[found.get('up') ?? '-y'] ?? UPS['-y']);
-  const fov = (found.get('fov') ?? '').split(',').map(Number);
+  const up = asked && length(asked) > 1e-3 ? unit(asked) : (UPS[values.get('up') ?? '-y'] ?? UPS['-y']);
+  const fov = (values.get('fov') ?? '').split(',').map(Number);
   const wide = fov.length === 2 && fov.every((each) => each > 0 && each < 170) ? { fov: fov as [number, number] } : {};
   return eye && target && length(difference(eye, target)) > 1e-9 ? { eye, target, up, ...wide } : null;
 }

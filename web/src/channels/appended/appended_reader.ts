@@ -5,13 +5,14 @@
 import { rowsOf, viewOf } from '../../core/bytes.ts';
 import { type Gaussians, opacity, where, withDegree } from '../../core/gaussians.ts';
 import { moved, type Similarity } from '../../core/similarity.ts';
+import { type Quaternion, quaternionProduct } from '../../core/vectors.ts';
 import type { Words } from '../../core/words.ts';
 import { encryptBlocks } from '../../keys/aes.ts';
 import { type Derive, expand, here } from '../../keys/keys.ts';
 import { keySecret, type Payload, type Reader, unsealedShards } from '../container.ts';
 import { COARSE_BYTES, coarseForeign } from '../foreign.ts';
 import type { Codewords, Shards } from '../reed_solomon.ts';
-import { type Found, LEAST, ONE_IN, pilotsOf, POSITION_BITS, readPilots } from './pilots.ts';
+import { LEAST, ONE_IN, type PilotData, pilotsOf, POSITION_BITS, readPilots } from './pilots.ts';
 
 // Gaussians sampled for pilots; number of lattice offsets tried, with at least this many standard deviations more pilots
 // than by chance.
@@ -35,16 +36,15 @@ export class AppendedReader implements Reader {
     const colours = Uint8Array.from(faint.sh, (each) => nearest(each / COLOUR_STEP + 2 ** (COLOUR_BITS - 1) - 0.5, COLOUR_BITS));
     const steps = Float64Array.from(faint.logScales, (each) => each / SCALE_STEP); // of their lattice, which lies anywhere
     for (const shifts of [likelyShifts, shiftsWithPilots]) {
-      let best: { found: Found; scales: Uint8Array } | null = null;
+      let best: { data: PilotData; scales: Uint8Array } | null = null;
       for (const shift of shifts(steps, colours)) {
         const scales = scalesAt(steps, shift);
-        const found = readPilots(invariantsOf(colours, scales), faint.means);
-        if (found && (best === null || found.agreeing > best.found.agreeing)) best = { found, scales };
+        const data = readPilots(invariantsOf(colours, scales), faint.means);
+        if (data && (best === null || data.agreeing > best.data.agreeing)) best = { data, scales };
       }
       if (best !== null) {
-        const { found, scales } = best;
-        const words = wordsOfPoints(colours, scales, inOwnFrame(faint, found.toOwn));
-        return new AppendedReader(found.salt, words, model, found.toOwn);
+        const { data: { salt, toOwn }, scales } = best;
+        return new AppendedReader(salt, wordsOfPoints(colours, scales, inOwnFrame(faint, toOwn)), model, toOwn);
       }
     }
     return null;
@@ -69,10 +69,10 @@ function shiftsWithPilots(steps: Float64Array, colours: Uint8Array): number[] {
   const count = Math.min(SAMPLE, steps.length / 3);
   const every = steps.length / 3 / count;
   const rows = Array.from({ length: count }, (_, at) => Math.floor(at * every));
-  const [few, own] = [rowsOf(steps, rows, 3), rowsOf(colours, rows, 3)];
+  const [fewSteps, fewColours] = [rowsOf(steps, rows, 3), rowsOf(colours, rows, 3)];
   const byChance = count / ONE_IN;
-  return allShifts(few)
-    .map((shift) => ({ shift, pilots: pilotsOf(invariantsOf(own, scalesAt(few, shift))).length }))
+  return allShifts(fewSteps)
+    .map((shift) => ({ shift, pilots: pilotsOf(invariantsOf(fewColours, scalesAt(fewSteps, shift))).length }))
     .filter(({ pilots }) => pilots > byChance + NOT_BY_CHANCE * Math.sqrt(byChance))
     .sort((a, b) => b.pilots - a.pilots)
     .slice(0, TRIED)
@@ -149,13 +149,14 @@ const [COLOUR_BITS, SCALE_BITS, TURN_BITS] = [7, 6, 5];
 const [FAINTEST, STRONGEST] = [0.4 / 255, 1.6 / 255]; // after rounding
 const [COLOUR_STEP, SCALE_STEP] = [0.0275, 0.08];
 const TURNS_REACH = (256 / 511) * Math.SQRT1_2; // bound of x, y and z, so that w is the largest
+const UNITS: readonly Quaternion[] = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]];
 const [FARTHEST, MAX_SHIFTS] = [1 << 12, 500]; // steps of log scales: range, and number of offsets tried
 
 /** The Gaussians as faint as appended ones, without harmonics. */
 function candidates(model: Gaussians): Gaussians {
   const faint = where(model, (row) => {
-    const own = opacity(model.opacityLogits[row]);
-    return own > FAINTEST && own < STRONGEST;
+    const alpha = opacity(model.opacityLogits[row]);
+    return alpha > FAINTEST && alpha < STRONGEST;
   });
   return withDegree(faint, 0);
 }
@@ -189,49 +190,47 @@ function allShifts(steps: Float64Array): number[] {
   const sorted = steps.map((each) => Math.max(-FARTHEST, Math.min(FARTHEST, each))).sort();
   const [low, high] = [0.01, 0.99].map((share) => sorted[Math.round(share * (sorted.length - 1))]);
   const end = Math.max(Math.min(high - 2 ** (SCALE_BITS - 2), low + MAX_SHIFTS), low);
-  const found: number[] = [];
-  for (let shift = low - 2 ** (SCALE_BITS - 1); shift < end; shift += 0.25) found.push(shift);
-  return found;
+  const shifts: number[] = [];
+  for (let shift = low - 2 ** (SCALE_BITS - 1); shift < end; shift += 0.25) shifts.push(shift);
+  return shifts;
 }
 
 /** [N] the first 39 bits of words, colours and scales [N, 3]: invariant under similarity transforms. */
 function invariantsOf(colours: Uint8Array, scales: Uint8Array): Words {
-  const found = new Uint32Array((2 * colours.length) / 3);
+  const invariants = new Uint32Array((2 * colours.length) / 3);
   for (let row = 0; row < colours.length / 3; row++) {
     const at = 3 * row;
     const colour = (colours[at] << 14) | (colours[at + 1] << 7) | colours[at + 2]; // 21 bits
     const scale = (scales[at] << 12) | (scales[at + 1] << 6) | scales[at + 2]; // 18 bits
-    found[2 * row] = (colour << 18) | scale;
-    found[2 * row + 1] = colour >>> 14;
+    invariants[2 * row] = (colour << 18) | scale;
+    invariants[2 * row + 1] = colour >>> 14;
   }
-  return found;
+  return invariants;
 }
 
 /** [N, 6] nearest lattice points of positions and rotations; `toOwn`: from the world to the own frame. */
 function inOwnFrame(faint: Gaussians, toOwn: Similarity): Uint16Array {
-  const found = new Uint16Array(6 * faint.count);
+  const points = new Uint16Array(6 * faint.count);
   const { means, quats } = moved(toOwn, faint);
   for (let row = 0; row < faint.count; row++) {
     for (let axis = 0; axis < 3; axis++) {
-      found[6 * row + axis] = nearest(means[3 * row + axis] * 2 ** POSITION_BITS - 0.5, POSITION_BITS);
+      points[6 * row + axis] = nearest(means[3 * row + axis] * 2 ** POSITION_BITS - 0.5, POSITION_BITS);
     }
-    const turned = [...quats.subarray(4 * row, 4 * row + 4)];
-    withLargestW(turned).slice(1).forEach((part, axis) => {
-      found[6 * row + 3 + axis] = nearest(((part + TURNS_REACH) / (2 * TURNS_REACH)) * 2 ** TURN_BITS - 0.5, TURN_BITS);
+    const [w, x, y, z] = quats.subarray(4 * row, 4 * row + 4);
+    withLargestW([w, x, y, z]).slice(1).forEach((part, axis) => {
+      points[6 * row + 3 + axis] = nearest(((part + TURNS_REACH) / (2 * TURNS_REACH)) * 2 ** TURN_BITS - 0.5, TURN_BITS);
     });
   }
-  return found;
+  return points;
 }
 
-const ORDER = [[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]]; // q, q i, q j, q k
-const SIGNS = [[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [-1, 1, -1, 1]];
-
 /** The unit quaternion wxyz of the same ellipsoid with w the largest component. */
-function withLargestW(quat: number[]): number[] {
+function withLargestW(quat: Quaternion): Quaternion {
   const length = Math.max(1e-30, Math.hypot(...quat));
   const largest = [0, 1, 2, 3].reduce((a, b) => (Math.abs(quat[b]) > Math.abs(quat[a]) ? b : a));
-  const found = ORDER[largest].map((part, at) => (quat[part] / length) * SIGNS[largest][at]);
-  return found[0] < 0 ? found.map((each) => -each) : found;
+  // By half a turn about an axis of the ellipsoid.
+  const [w, x, y, z] = quaternionProduct(quat, UNITS[largest]).map((each) => each / length);
+  return w < 0 ? [-w, -x, -y, -z] : [w, x, y, z];
 }
 
 function nearest(steps: number, bits: number): number {

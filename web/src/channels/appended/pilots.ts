@@ -1,6 +1,7 @@
 /** Pilots: appended Gaussians readable without a key, and their frame; counterpart of `keyss.channels.appended.pilots`. */
 import { mostFrequent, rowsOf } from '../../core/bytes.ts';
-import { fittedRotation, movedPoint, rotationOf, type Similarity } from '../../core/similarity.ts';
+import { fittedSimilarity, movedPoint, type Similarity } from '../../core/similarity.ts';
+import { vectorAt } from '../../core/vectors.ts';
 import { mix, type Words } from '../../core/words.ts';
 import { SALT_BYTES } from '../../keys/keys.ts';
 
@@ -15,30 +16,30 @@ const SAMPLE = 1024; // pilots tried first
 const NEAR = 1.5 / 2 ** POSITION_BITS; // in the own frame
 
 /** The data that pilots encode. */
-export interface Found {
+export interface PilotData {
   readonly toOwn: Similarity; // from the world to the own frame
   readonly agreeing: number; // pilots
   readonly salt: Uint8Array;
 }
 
 /** Frame and salt from the pilots among candidates with `invariants` [N] and world `means` [N, 3]. */
-export function readPilots(invariants: Words, means: Float32Array): Found | null {
-  const own = pilotsOf(invariants);
-  if (own.length < AGREE) return null;
-  const there = rowsOf(means, own, 3);
-  const expected = Float64Array.from(own.flatMap((row) => placeOf(invariants, row)));
-  const sample = Math.min(own.length, SAMPLE);
-  const some = Array.from({ length: sample }, (_, at) => Math.floor((at * own.length) / sample));
+export function readPilots(invariants: Words, means: Float32Array): PilotData | null {
+  const pilots = pilotsOf(invariants);
+  if (pilots.length < AGREE) return null;
+  const there = rowsOf(means, pilots, 3);
+  const expected = Float64Array.from(pilots.flatMap((row) => placeOf(invariants, row)));
+  const sample = Math.min(pilots.length, SAMPLE);
+  const some = Array.from({ length: sample }, (_, at) => Math.floor((at * pilots.length) / sample));
   const draw = drawing(sample);
   let best: number[] = [];
   for (let attempt = 0; attempt < TRIES && best.length <= Math.max(AGREE, sample / 2); attempt++) {
     const near = agreeing(there, expected, [some[draw()], some[draw()], some[draw()]], some);
     if (near.length > best.length) best = near;
   }
-  for (let round = 0; round < 3 && best.length >= AGREE; round++) best = agreeing(there, expected, best, own.keys());
+  for (let round = 0; round < 3 && best.length >= AGREE; round++) best = agreeing(there, expected, best, pilots.keys());
   if (best.length < AGREE) return null;
   const toOwn = fittedSimilarity(there, expected, best);
-  const salt = saltOf(invariants, best.map((at) => own[at]));
+  const salt = saltOf(invariants, best.map((at) => pilots[at]));
   return toOwn && salt && { toOwn, agreeing: best.length, salt };
 }
 
@@ -46,14 +47,12 @@ export function readPilots(invariants: Words, means: Float32Array): Found | null
 function agreeing(
   there: Float32Array, expected: Float64Array, chosen: number[], among: Iterable<number>,
 ): number[] {
-  const found: number[] = [];
   const similarity = fittedSimilarity(there, expected, chosen);
-  if (!similarity) return found;
-  for (const at of among) {
-    const place = movedPoint(similarity, there.subarray(3 * at, 3 * at + 3));
-    if (place.every((each, axis) => Math.abs(each - expected[3 * at + axis]) < NEAR)) found.push(at);
-  }
-  return found;
+  if (!similarity) return [];
+  return [...among].filter((at) => {
+    const place = movedPoint(similarity, vectorAt(there, at));
+    return place.every((each, axis) => Math.abs(each - expected[3 * at + axis]) < NEAR);
+  });
 }
 
 /** Deterministic pseudo-random numbers below `count`. */
@@ -72,8 +71,8 @@ function saltOf(invariants: Words, rows: number[]): Uint8Array | null {
     parts[said >>> 16].push(said & 0xffff);
   }
   const salt = new Uint8Array(SALT_BYTES);
-  for (const [part, own] of parts.entries()) {
-    const best = mostFrequent(own);
+  for (const [part, values] of parts.entries()) {
+    const best = mostFrequent(values);
     if (!best) return null;
     salt.set([best[0] >> 8, best[0] & 255], 2 * part);
   }
@@ -101,37 +100,4 @@ function placeOf(invariants: Words, row: number): number[] {
   const [low, high] = publicHash(invariants, row);
   const place = mix(low, high)[1];
   return [place >>> 22, (place >>> 12) & 1023, (place >>> 2) & 1023].map((each) => (each + 0.5) / 2 ** POSITION_BITS);
-}
-
-/**
- * The similarity from `source` [P, 3] to `target` with least squared error; null if degenerate. The scale is
- * the value of the rotation's fit divided by the spread of `source` (Umeyama 1991).
- */
-export function fittedSimilarity(
-  source: ArrayLike<number>, target: ArrayLike<number>, rows: ArrayLike<number>,
-): Similarity | null {
-  const [centre, goal] = [middle(source, rows), middle(target, rows)];
-  const m = new Float64Array(9); // [3, 3] sums of products of source and target
-  let spread = 0;
-  for (let index = 0; index < rows.length; index++) {
-    for (let i = 0; i < 3; i++) {
-      const a = source[3 * rows[index] + i] - centre[i];
-      spread += a * a;
-      for (let j = 0; j < 3; j++) m[3 * i + j] += a * (target[3 * rows[index] + j] - goal[j]);
-    }
-  }
-  const { value, vector } = fittedRotation(m);
-  const scale = value / spread;
-  if (!(spread > 0 && scale > 0 && Number.isFinite(scale) && vector.every(Number.isFinite))) return null;
-  const turned = { scale, rotation: rotationOf(vector), translation: [0, 0, 0] };
-  const away = movedPoint(turned, centre);
-  return { ...turned, translation: goal.map((each, axis) => each - away[axis]) };
-}
-
-function middle(points: ArrayLike<number>, rows: ArrayLike<number>): number[] {
-  return [0, 1, 2].map((axis) => {
-    let sum = 0;
-    for (let index = 0; index < rows.length; index++) sum += points[3 * rows[index] + axis];
-    return sum / rows.length;
-  });
 }

@@ -38,8 +38,8 @@ export class ColoursReader implements Reader {
       if (header === null) continue;
       const carriers = this.alignments[index];
       for (const shift of header.level === ONE ? [0] : [0, shiftOf(header, carriers)]) {
-        const found = await payloadOf(header, secrets, carriers, shift);
-        if (found !== null) return found;
+        const payload = await payloadOf(header, secrets, carriers, shift);
+        if (payload !== null) return payload;
       }
     }
     if (headers.some((each) => each !== null)) throw tooMuchLost();
@@ -50,26 +50,26 @@ export class ColoursReader implements Reader {
 /** The payload decrypted by the header's key, or null. */
 async function payloadOf(header: Header, secrets: Secrets, carriers: Carriers, shift: number): Promise<Payload | null> {
   const rows = ownRows(header, secrets, carriers);
-  const own = chosen(carriers, rows);
-  const bits = bitCounts(own.impact.map((each) => each - shift), header.level);
+  const used = chosen(carriers, rows);
+  const bits = bitCounts(used.impact.map((each) => each - shift), header.level);
   const sure: number[] = [];
   bits.forEach((count, row) => {
-    const each = (header.occupancy * (1 - CHANGED) * (1 - own.errorProbability[row])) / own.idCounts[row];
+    const each = (header.occupancy * (1 - CHANGED) * (1 - used.errorProbability[row])) / used.idCounts[row];
     for (let bit = 0; bit < COLUMNS * count; bit++) sure.push(each);
   });
   if (8 * header.size > MAX_RATE * sure.length) return null;
-  const [values, seeds, code] = [readBits(header.key, own, bits), seedsOf(header.key, 'seeds', own, bits), new Fountain(8 * header.size)];
-  const found = code.decode(seeds, values.map((value, at) => value * sure[at]));
+  const [values, seeds, code] = [readBits(header.key, used, bits), seedsOf(header.key, 'seeds', used, bits), new Fountain(8 * header.size)];
+  const data = code.decode(seeds, values.map((value, at) => value * sure[at]));
   let payload: Payload;
   try {
-    payload = (await unsealed(header.key, packBits(found)))[1];
+    payload = (await unsealed(header.key, packBits(data)))[1];
   } catch (error) {
     if (error instanceof InputError) return null;
     throw error;
   }
-  const written = code.encode(found, seeds);
+  const written = code.encode(data, seeds);
   const agreement = values.map((value, at) => value * (1 - 2 * written[at])); // -1 to 1
-  const share = foreignShareOf(agreement, header, own, bits, partWeights(carriers, rows));
+  const share = foreignShareOf(agreement, header, used, bits, partWeights(carriers, rows));
   return share > FOREIGN ? { ...payload, foreign: Math.round(share * carriers.count) } : payload;
 }
 
@@ -85,11 +85,11 @@ function partWeights({ count, logScales, opacities, idCounts }: Carriers, rows: 
 
 /** The share of foreign carriers that is certain: the agreement of foreign ones is 0 in the mean. */
 function foreignShareOf(
-  agreement: Float64Array, header: Header, own: Carriers, bits: Uint8Array, weights: readonly number[],
+  agreement: Float64Array, header: Header, used: Carriers, bits: Uint8Array, weights: readonly number[],
 ): number {
   let [agreed, expected, variance, at] = [0, 0, 0, 0];
   bits.forEach((count, row) => {
-    const held = header.occupancy * (1 - own.errorProbability[row]);
+    const held = header.occupancy * (1 - used.errorProbability[row]);
     for (let end = at + COLUMNS * count; at < end; at++) {
       const most = weights[row] * Math.abs(agreement[at]);
       agreed += weights[row] * agreement[at];
@@ -242,23 +242,23 @@ function bitCounts(impact: Float64Array, level: number): Uint8Array {
 
 /** [B] the seeds of all bits of carriers, for the fountain; `bits` [C]: of each number. */
 function seedsOf(secret: Uint8Array, label: string, { ids }: Carriers, bits: Uint8Array): Words {
-  const [pairs, found] = [randomPairs(secret, label, ids), [] as number[]];
+  const [pairs, seeds] = [randomPairs(secret, label, ids), [] as number[]];
   bits.forEach((count, row) => {
     for (let column = 0; column < COLUMNS; column++) {
       for (let bit = 0; bit < count; bit++) {
         const [low, high] = mix(column * MAX_BITS + bit);
-        found.push(...mix(pairs[4 * row] ^ low, pairs[4 * row + 1] ^ high));
+        seeds.push(...mix(pairs[4 * row] ^ low, pairs[4 * row + 1] ^ high));
       }
     }
   });
-  return Uint32Array.from(found);
+  return Uint32Array.from(seeds);
 }
 
 /**
  * [B] P(0) - P(1) of all bits of carriers, `bits` [C] in each number: dithered quantisation index modulation with soft decisions.
  */
 function readBits(secret: Uint8Array, { ids, colours }: Carriers, bits: Uint8Array): Float64Array {
-  const [dithers, found] = [fractions(secret, 'dither', ids), [] as number[]];
+  const [dithers, differences] = [fractions(secret, 'dither', ids), [] as number[]];
   bits.forEach((count, row) => {
     const period = 2 ** count;
     for (let column = 0; column < COLUMNS; column++) {
@@ -272,9 +272,9 @@ function readBits(secret: Uint8Array, { ids, colours }: Carriers, bits: Uint8Arr
           const label = points[at] & (period - 1);
           return ((label ^ (label >> 1)) >> bit) & 1 ? -weight : weight;
         });
-        found.push(signed.reduce((sum, each) => sum + each) / all);
+        differences.push(signed.reduce((sum, each) => sum + each) / all);
       }
     }
   });
-  return Float64Array.from(found);
+  return Float64Array.from(differences);
 }

@@ -6,8 +6,8 @@ import { sha256 } from '@noble/hashes/sha2.js';
 import { createBLAKE2b } from 'hash-wasm';
 import { ascii, joined, quantile } from '../../core/bytes.ts';
 import { coefficients, type Gaussians } from '../../core/gaussians.ts';
+import { ID_BYTES } from '../foreign.ts';
 
-export const ID_BYTES = 16;
 export const DEPTHS: readonly number[] = [4, 6, 8]; // bits of a field that are read
 export const [LEAST, DEEPEST] = [4, 8];
 const GEOMETRY = 8; // fields before the harmonics: three scales, four parts of a quaternion, opacity
@@ -70,7 +70,7 @@ export async function gaussianIds(gaussians: Gaussians, fields: Fields): Promise
   // hash-wasm has no option for it: the last of the parameters with which the state begins, as of RFC 7693.
   PERSONALISATION.forEach((byte, at) => (start[STATE + 48 + at] ^= byte));
   const { count, width, words, inUse } = fields;
-  const found = new Uint8Array(count * ID_BYTES);
+  const ids = new Uint8Array(count * ID_BYTES);
   const means = new Uint32Array(gaussians.means.buffer, gaussians.means.byteOffset, 3 * count);
   const row = new Uint32Array(3 + width);
   const bytes = new Uint8Array(row.buffer);
@@ -78,18 +78,18 @@ export async function gaussianIds(gaussians: Gaussians, fields: Fields): Promise
     row.set(means.subarray(3 * index, 3 * index + 3));
     row.set(words.subarray(index * width, (index + 1) * width), 3);
     for (const field of inUse) row[3 + field] &= ~LOW | 1;
-    found.set(hasher.load(start).update(bytes).digest('binary'), index * ID_BYTES);
+    ids.set(hasher.load(start).update(bytes).digest('binary'), index * ID_BYTES);
   }
-  return found;
+  return ids;
 }
 
 /** [N, F] the low bits at the greatest depth: a byte for each field in use. */
 export function lowBits({ count, width, words, inUse }: Fields): Uint8Array {
-  const found = new Uint8Array(count * inUse.length);
+  const bits = new Uint8Array(count * inUse.length);
   for (let row = 0, to = 0; row < count; row++) {
-    for (let field = 0; field < inUse.length; field++) found[to++] = words[row * width + inUse[field]] >>> 1;
+    for (let field = 0; field < inUse.length; field++) bits[to++] = words[row * width + inUse[field]] >>> 1;
   }
-  return found;
+  return bits;
 }
 
 /** Whole bytes in the low bits of one Gaussian with `fields` in use. */
@@ -101,7 +101,7 @@ export function lowWidth(fields: number, depth: number): number {
 export function atDepth(low: Uint8Array, fields: number, depth: number): Uint8Array {
   if (depth === DEEPEST) return low;
   const size = lowWidth(fields, depth);
-  const found = new Uint8Array((low.length / fields) * size);
+  const rows = new Uint8Array((low.length / fields) * size);
   const mask = (1 << depth) - 1;
   for (let from = 0, end = 0, to = 0; from < low.length; ) {
     let [bits, held] = [0, 0];
@@ -109,11 +109,11 @@ export function atDepth(low: Uint8Array, fields: number, depth: number): Uint8Ar
     for (let field = 0; field < fields; field++) {
       bits = (bits << depth) | (low[from++] & mask);
       held += depth;
-      if (held >= 8 && to < end) found[to++] = bits >>> (held -= 8);
+      if (held >= 8 && to < end) rows[to++] = bits >>> (held -= 8);
       bits &= (1 << held) - 1;
     }
   }
-  return found;
+  return rows;
 }
 
 const SALTS = 4; // tried

@@ -123,15 +123,15 @@ export function log2(value: number): number {
 export function lastBits({ fields, rows }: Levels): Uint8Array {
   let size = 0;
   for (const field of fields) for (let index = 0; index < rows.length; index++) size += field.bits(rows[index]);
-  const found = new Uint8Array(size);
+  const bits = new Uint8Array(size);
   let at = 0;
   for (const field of fields) {
     for (let index = 0; index < rows.length; index++) {
       const [own, level] = [field.bits(rows[index]), field.level(rows[index])];
-      for (let bit = 0; bit < own; bit++) found[at++] = (level >> bit) & 1;
+      for (let bit = 0; bit < own; bit++) bits[at++] = (level >> bit) & 1;
     }
   }
-  return found;
+  return bits;
 }
 
 /** 12 bytes of a hash of colours and opacities, which never change: it binds blocks to their model. */

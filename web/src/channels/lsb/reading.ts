@@ -14,9 +14,9 @@ import { type Derive, here } from '../../keys/keys.ts';
 import {
   checkOf, keySecret, PARAMETER_BYTES, type Parameters, type Payload, type Reader, unpackedParameters, unsealed, unsealedShards,
 } from '../container.ts';
-import { EXACT_BYTES, exactForeign } from '../foreign.ts';
+import { EXACT_BYTES, exactForeign, ID_BYTES } from '../foreign.ts';
 import type { Codewords, Shards } from '../reed_solomon.ts';
-import { atDepth, DEEPEST, DEPTHS, fieldsOf, gaussianIds, ID_BYTES, LEAST, lowBits, lowWidth, saltOf, salts } from './bits.ts';
+import { atDepth, DEEPEST, DEPTHS, fieldsOf, gaussianIds, LEAST, lowBits, lowWidth, saltOf, salts } from './bits.ts';
 import { BLOCK_BYTES, lastBits, type Levels, levelsOf, modelHash, readBlocks } from './fields.ts';
 import { isTagged, isWhole, message, parameterPads, shardBytes, shardsOf, type Table } from './shards.ts';
 

@@ -6,9 +6,9 @@ import { bytesKey, mostFrequent, rowsOf, viewOf } from '../../core/bytes.ts';
 import { encryptBlocks } from '../../keys/aes.ts';
 import { expand } from '../../keys/keys.ts';
 import { PARAMETER_BYTES } from '../container.ts';
+import { ID_BYTES } from '../foreign.ts';
 import type { Codewords, Shards } from '../reed_solomon.ts';
 
-const ID_BYTES = 16;
 const BLOCK = 16; // bytes of a block of AES
 const CANDIDATES = 8; // Gaussians that are looked at for each place
 const NUMBER_BYTES = 2;
