@@ -81,12 +81,14 @@ def coarse_lengths(quats: Words32) -> Doubles:
 def gaussian_ids(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
     """[N, 16] IDs of the Gaussians: public hashes (BLAKE2b) of the bits that embedding never changes."""
     columns = (layout or Layout.of(gaussians)).columns
+    stays = np.full(8 + 3 * gaussians.sh.shape[1], ~np.uint32(0))  # of positions and `used_words`
+    stays[3 + columns] = ~LOW | np.uint32(1)
 
     def ids(start: int, stop: int) -> Bytes:
         own = gaussians[start:stop]
-        used = used_words(own)
-        used[:, columns] &= ~LOW | np.uint32(1)
-        return blake2b_rows(np.concatenate([bit_patterns(own.means), used], axis=1), _PERSON)
+        words = np.concatenate([bit_patterns(own.means), *group_words(own)], axis=1)
+        words &= stays
+        return blake2b_rows(words, _PERSON)
 
     return np.concatenate([np.zeros((0, ID_BYTES), np.uint8), *in_blocks(ids, len(gaussians), BLOCK)])
 

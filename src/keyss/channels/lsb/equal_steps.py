@@ -37,10 +37,8 @@ _DRAWS = 16
 _PARTS = np.array([[1 / 16], [1 / 8], [1 / 4]])  # of a cell
 _ZERO, _COLOURS, _NOTHING = -1, -2, -3  # what a Gaussian is compared with, instead of another one
 _KINDS = _GEOMETRY, _HARMONICS, _BETWEEN_COLOURS = 0, 1, 2
-_FIRST, _LANES = (
-    16,
-    48,
-)  # place of the harmonics of degrees 1 to 3 among a Gaussian's numbers, and room for them
+_FIRST = 16  # place of the harmonics of degrees 1 to 3 among a Gaussian's numbers
+_LANES = 48  # room for them
 _BLOCK = 16  # points that a sweep looks at at once
 _NAN, _EXPONENT, _MAGNITUDE = np.uint32(0x7FC00000), np.uint32(0x7F800000), np.uint32(0x7FFFFFFF)
 
