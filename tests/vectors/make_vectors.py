@@ -195,7 +195,7 @@ def write_counted() -> None:
 
 
 def carrier_bits(model: Gaussians) -> dict[str, Any]:
-    """Number and SHA-256 of the last bits of all levels of a file, or of the one that a model was decoded from."""
+    """Number and SHA-256 of the last bits of all levels of a file, or of the one it was decoded from."""
     decoded = Decoded.of(model)
     codes, exact = (decoded.codes, decoded.exact) if decoded else (model.codes, None)  # type: ignore[attr-defined]
     bits = last_bits(in_counted_order(codes, exact)[2])

@@ -42,9 +42,7 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]
         publish: Publish = "converted" if kind.startswith("appended") else "unchanged"
         channel = channel_for(publish, format=format, cover=cover)  # type: ignore[arg-type]
         keys, secrets = keys_of(kind), [bright_model(100, seed).with_sh_degree(1) for seed in (1, 2)]
-        model = embed_models(
-            channel.prepare(cover), keys, secrets[: len(keys)], entropy=bytes(32)
-        ).gaussians
+        model = embed_models(channel.prepare(cover), keys, secrets[: len(keys)], entropy=bytes(32)).gaussians
         write_model(folder / f"stego.{kind}", model)
         return folder / f"stego.{kind}"
 
