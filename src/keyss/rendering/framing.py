@@ -35,11 +35,14 @@ _BELOW = 0.05  # radii by which the middle of a model is below a floor across y 
 
 @dataclass(frozen=True)
 class Frame:
-    """A sphere around the subject of a model, and the up direction."""
+    """A sphere around the subject of a model, the up direction, and some of the Gaussians in the sphere."""
 
     middle: Doubles  # [3]
     radius: float
     up: Doubles  # [3] unit vector
+    means: Doubles  # [S, 3]
+    weights: Doubles  # [S] opacities
+    alone: bool  # True if the model has no surroundings: the sphere holds all but outliers
 
 
 @torch.no_grad()
@@ -59,24 +62,25 @@ def frame_of(model: Gaussians) -> Frame:
     sizes = np.sqrt(ordered[:, 1] * ordered[:, 2])
     middle, radius = _densest(means, weights)
     inside = _distances(means, middle) < radius
-    if inside.all() or _median(sizes[~inside], weights[~inside]) < _COARSER * _median(
+    alone = bool(inside.all()) or _median(sizes[~inside], weights[~inside]) < _COARSER * _median(
         sizes[inside], weights[inside]
-    ):
+    )
+    if alone:
         middle = _middle(means, weights)
         distances = _distances(means, middle)
-        radius = max(_quantile(distances, weights, _OUTLIERS), 1e-6)
+        radius = max(quantile(distances, weights, _OUTLIERS), 1e-6)
         inside = distances <= radius
-    large = _quantile(sizes, np.ones(len(sizes)), 0.95)
+    large = quantile(sizes, np.ones(len(sizes)), 0.95)
     extents = weights * np.minimum(sizes, large)
     normals = _normals(model.quats.double().numpy(), scales.argmin(axis=1))
     up = _up((means[inside] - middle) / radius, normals[inside], extents[inside])
-    return Frame(middle, float(radius), up)
+    return Frame(middle, float(radius), up, means[inside], weights[inside], alone)
 
 
 def _densest(means: Doubles, weights: Doubles) -> tuple[Doubles, float]:
     """Middle and radius of the sphere with the largest weight / radius^_GROWTH."""
     middle = _middle(means, weights)
-    radius = max(_quantile(_distances(means, middle), weights, 0.995), 1e-6) / _SHRINK
+    radius = max(quantile(_distances(means, middle), weights, 0.995), 1e-6) / _SHRINK
     best, sphere = -1.0, (middle, radius)
     for _ in range(_STEPS):
         radius *= _SHRINK
@@ -169,10 +173,11 @@ def _middle(means: Doubles, weights: Doubles) -> Doubles:
 
 
 def _median(values: Doubles, weights: Doubles) -> float:
-    return _quantile(values, weights, 0.5)
+    return quantile(values, weights, 0.5)
 
 
-def _quantile(values: Doubles, weights: Doubles, share: float) -> float:
+def quantile(values: Doubles, weights: Doubles, share: float) -> float:
+    """The least of the values [N] such that those up to it have this share of the weights [N]."""
     order = np.argsort(values, kind="stable")
     total = np.cumsum(weights[order])
     return float(values[order[min(np.searchsorted(total, share * total[-1]), len(values) - 1)]])

@@ -7,15 +7,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from keyss.core.arrays import Doubles
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.core.scene import NEAR, ORDINARY_EXTENT, Camera, Scene, View, checked_background
 from keyss.files.models import is_model_source
 from keyss.kernels.memory import release
-from keyss.rendering.framing import Frame, frame_of
+from keyss.rendering.framing import Frame, frame_of, quantile
 from keyss.rendering.rasterize import MAX_SIDE
 from keyss.rendering.view import render
 
@@ -26,6 +28,7 @@ MAX_ELEVATION = 60.0  # degrees, up and down
 # Cycle of camera distances, relative to the one from which the whole model is visible.
 DISTANCES = (1.0, 0.75, 1.0, 0.5)
 TURNTABLE, _HEIGHT = 60, 0.25  # views; sine of their elevation
+_OUTLIERS, _MARGIN = 0.005, 0.9  # share on either side of a centered subject; part of a view for the subject
 TEST_EVERY, _LARGE = 12, 500_000  # views; minimum Gaussians of a model with slow renders
 _ORBIT_VIEWS, _SCENE_VIEWS, _SIZE = 4, 8, 256  # for comparing models
 
@@ -93,37 +96,71 @@ def orbit(model: Gaussians, size: int, views: int = VIEWS) -> list[Camera]:
     for index in range(views):
         # A Fibonacci lattice: equal steps of the sine of the elevation, golden angles of the azimuth.
         height = limit * (1 - 2 * (index + 0.5) / views)
-        azimuth = index * math.pi * (3 - math.sqrt(5))
-        distance = DISTANCES[index % len(DISTANCES)]
-        cameras.append(_around(frame, height, azimuth, distance, size, f"orbit_{index:03d}.png"))
+        outward = _outward(frame.up, height, index * math.pi * (3 - math.sqrt(5)))
+        distance = _far(frame) * DISTANCES[index % len(DISTANCES)]
+        cameras.append(_camera(frame, frame.middle, outward, distance, size, f"orbit_{index:03d}.png"))
     return cameras
 
 
 def turntable(model: Gaussians, size: int, views: int = TURNTABLE) -> list[Camera]:
-    """Cameras on a level circle a little above the subject of a model, with images of size x size pixels."""
+    """Cameras on a level circle a little above the subject of a model, with images of size x size pixels.
+
+    A subject without surroundings is centered, and whole in every view.
+    """
     frame = frame_of(model)
+    outwards = [_outward(frame.up, _HEIGHT, 2 * math.pi * index / views) for index in range(views)]
+    middle, distance = _whole(frame, outwards) if frame.alone else (frame.middle, _far(frame))
     return [
-        _around(frame, _HEIGHT, 2 * math.pi * index / views, 1.0, size, f"{index:03d}.png")
-        for index in range(views)
+        _camera(frame, middle, outward, distance, size, f"{index:03d}.png")
+        for index, outward in enumerate(outwards)
     ]
 
 
-def _around(frame: Frame, height: float, azimuth: float, distance: float, size: int, name: str) -> Camera:
-    """A camera that looks at the middle of a frame.
+def _whole(frame: Frame, outwards: Sequence[Doubles]) -> tuple[Doubles, float]:
+    """The center of a subject, and the least distance from which it is whole in each of these directions."""
+    basis = np.stack([*_sides(frame.up), frame.up])
+    low, high = (
+        np.array([quantile(axis, frame.weights, share) for axis in basis @ frame.means.T])
+        for share in (_OUTLIERS, 1 - _OUTLIERS)
+    )
+    middle: Doubles = (low + high) / 2 @ basis
+    offsets, half = frame.means - middle, _MARGIN * math.tan(math.radians(FIELD_OF_VIEW / 2))
+    distance = 1e-6
+    for outward in outwards:
+        right = np.cross(frame.up, outward) / np.linalg.norm(np.cross(frame.up, outward))
+        aside = np.maximum(abs(offsets @ right), abs(offsets @ np.cross(outward, right)))
+        distance = max(distance, float((aside / half + offsets @ outward).max()))
+    return middle, distance
 
-    `height`: sine of the elevation; `distance`: relative to the one from which the whole sphere is visible.
-    """
-    up = torch.from_numpy(frame.up).float()
-    front = torch.tensor([0.0, 0.0, -1.0] if abs(up[1]) > 0.5 else [0.0, -1.0, 0.0])
-    level = torch.nn.functional.normalize(front - (front @ up) * up, dim=0)
-    around = math.cos(azimuth) * level + math.sin(azimuth) * torch.linalg.cross(up, level)
-    outward = math.sqrt(1 - height * height) * around + height * up
-    half = math.radians(FIELD_OF_VIEW / 2)
-    position = torch.from_numpy(frame.middle).float() + outward * frame.radius / math.sin(half) * distance
-    focal = size / 2 / math.tan(half)
+
+def _far(frame: Frame) -> float:
+    """The distance at which the sphere fills an image."""
+    return frame.radius / math.sin(math.radians(FIELD_OF_VIEW / 2))
+
+
+def _sides(up: Doubles) -> Doubles:
+    """[2, 3] level unit vectors: towards the front, -z, or -y where z is up, and a quarter turn from it."""
+    front = np.array([0.0, 0.0, -1.0] if abs(up[1]) > 0.5 else [0.0, -1.0, 0.0])
+    level = front - (front @ up) * up
+    level /= np.linalg.norm(level)
+    return np.stack([level, np.cross(up, level)])
+
+
+def _outward(up: Doubles, height: float, azimuth: float) -> Doubles:
+    """[3] the unit vector at an azimuth from the front; `height`: sine of its elevation."""
+    around = np.array([math.cos(azimuth), math.sin(azimuth)]) @ _sides(up)
+    outward: Doubles = math.sqrt(1 - height * height) * around + height * up
+    return outward
+
+
+def _camera(frame: Frame, middle: Doubles, outward: Doubles, distance: float, size: int, name: str) -> Camera:
+    """A camera at a distance from `middle`, at which it looks."""
+    focal = size / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
     K = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
     near = NEAR * min(1.0, frame.radius / ORDINARY_EXTENT)
-    return Camera(look_at(position, -outward, up), K, size, size, name, near)
+    vectors = middle + distance * outward, -outward, frame.up
+    viewmat = look_at(*(torch.from_numpy(vector).float() for vector in vectors))
+    return Camera(viewmat, K, size, size, name, near)
 
 
 def look_at(position: Tensor, forward: Tensor, up: Tensor) -> Tensor:
