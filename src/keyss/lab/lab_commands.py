@@ -160,6 +160,7 @@ def compare(
     )
     if isinstance(comparison, Forecast):
         _print_forecast(comparison)
+        print("Controls are plain models of the cover with other seeds, with which secrecy is measured.")
         return
     for heads, *rows in comparison_tables(comparison) if progress.level >= 0 else ():
         print_table(heads, rows)

@@ -106,7 +106,7 @@ def test_command(keyss: Run, out: Path, folders: tuple[Path, Path], tmp_path: Pa
     assert planned.status == 0, planned.err
     assert not (tmp_path / "new").exists()
     assert [line.split("  ")[0] for line in planned.out.splitlines()[1:6]] == [
-        *(f"plain model of {scene}, 20 steps, 150 Gaussians, seed 5" for scene in "ab"),
+        *(f"plain model of {scene}, 20 steps, 150 Gaussians" for scene in "ab"),
         *(f"{mask}, a-b" for mask in ("op", "op,ro", "op,ro,sc,xyz")),
     ]
     assert "5 to do" in planned.out

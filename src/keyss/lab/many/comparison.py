@@ -34,7 +34,7 @@ from keyss.runs.open_run import HidingRun
 
 STEM = "comparison"  # file names without their suffix
 MEASURES = ("files", "pictures", "secrecy", "survival")
-CONTROLS = ("control-1", "control-2")  # names of the seeds of plain models of the cover
+CONTROLS = ("control-1", "control-2")  # plain models of the cover; the names of their seeds
 
 # Every method, and its variants.
 EVERY = tuple(
@@ -146,14 +146,15 @@ def compare(
     fit = replace(next(iter(chosen.values())).fit, seed=seeds[0], **given)
     scenes = [os.path.realpath(cover), os.path.realpath(secret)]
     folder = TrialFolder(Path(out), common={"views": ViewOptions(width), "device": device})
-    controls = [folder.plain(scenes[0], replace(fit, seed=fit.seed_of(name))) for name in CONTROLS]
+    controls = [folder.plain(scenes[0], replace(fit, seed=fit.seed_of(name)), name) for name in CONTROLS]
+    shown = {seed: f"seed {seed}" * (len(seeds) > 1) for seed in seeds}
     places = {
-        (name, seed): _add(folder, name, scenes, preset, replace(fit, seed=seed), controls)
+        (name, seed): _add(folder, name, scenes, preset, replace(fit, seed=seed), controls, shown[seed])
         for name, preset in chosen.items()
         for seed in seeds
     }
     if dry_run or methods:
-        forecast = folder.forecast()
+        forecast = folder.forecast(reporter)
         for name in methods:
             if reason := forecast.refused.get(places[name, seeds[0]]):
                 raise UsageError(f"{name}: not possible: {reason}")
@@ -186,8 +187,9 @@ def _add(
     preset: MethodOptions,
     fit: FitConfig,  # with the total steps per scene
     controls: list[str],
+    note: str,
 ) -> Path:
-    """Add a hiding and its plain fits; returns the folder of the hiding."""
+    """Add a hiding and its plain fits; returns the folder of the hiding. `note`: see `TrialFolder.plain`."""
     half = fit.iterations // 2
     continues = [training.continues and training.steps > 0 for training in preset.training(2)]
     options = preset.with_fit(
@@ -200,6 +202,7 @@ def _add(
         folder.plain(
             scene,
             replace(fit, iterations=count, sh_degree=config.sh_degree, max_gaussians=config.max_gaussians),
+            note,
         )
         for scene, count, config in zip(scenes, steps, options.fits(2), strict=True)
     ]

@@ -168,11 +168,12 @@ def reproduce(
         shown = group[: run.secrets + 1]
         sources = [paths[scene] for scene in shown]
         fits = options.fits(len(sources))
-        models = [folder.plain(*fit) for fit in zip(sources, fits, strict=True)]
-        title = f"{name}, {'-'.join(group)}" + f", seed {seed}" * (len(seeds) > 1)
+        note = f"seed {seed}" * (len(seeds) > 1)
+        models = [folder.plain(*fit, note) for fit in zip(sources, fits, strict=True)]
+        title = f"{name}, {'-'.join(group)}{note and f', {note}'}"
         places[folder.hiding(title, sources, options, models, measures=spec.measures)] = name, shown, seed
     if dry_run:
-        return folder.forecast()
+        return folder.forecast(reporter)
     outcomes = folder.run(reporter=reporter)
     numbers: dict[str, list[dict[str, float]]] = {name: [] for name in spec.runs}
     rows = []

@@ -161,7 +161,7 @@ def sweep(
         sources = [pair.cover, *pair.secrets]
         given = [pair.cover_model, *(pair.secret_models or [None] * len(pair.secrets))]
         models = [
-            model if model or is_model(source) else folder.plain(source, config)
+            model if model or is_model(source) else folder.plain(source, config, f"seed {config.seed}")
             for source, model, config in zip(sources, given, options.fits(len(sources)), strict=True)
         ]
         chosen = "".join(f" {name}={value}" for name, value in choices.items())
@@ -170,7 +170,7 @@ def sweep(
         labels = {"pair": pair.name, "method": method, **choices}
         rows.setdefault(place, (labels, [Path(source).stem for source in sources], seed))
     if dry_run:
-        return folder.forecast()
+        return folder.forecast(reporter)
     outcomes = folder.run(ray=ray, cores=cores, reporter=reporter)
     done = [TrialNumbers(*row, outcomes[place]) for place, row in rows.items() if outcomes[place].result]
     write_sweep_tables(folder.out, done)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import zip_longest
 from math import isfinite
@@ -22,7 +22,7 @@ from keyss._version import __version__
 from keyss.api.fit import fit
 from keyss.api.hide import hide
 from keyss.api.hide_arguments import Secret
-from keyss.core import ViewOptions
+from keyss.core import Scene, ViewOptions
 from keyss.files import read_model, write_bytes
 from keyss.fitting import FitConfig
 from keyss.keys import MasterKey, read_key
@@ -32,6 +32,7 @@ from keyss.lab.audits.trial_measures import MEASURES
 from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
+from keyss.rendering.orbit import is_model
 from keyss.runs import FitMetrics, HideMetrics, Manifest, read_manifest, read_record, record_bytes
 from keyss.runs.estimates import seconds_for
 from keyss.runs.files import METRICS, as_scene, stego_in
@@ -123,14 +124,26 @@ def run_trial(trial: Trial, folder: Path, reporter: Reporter) -> Result:
     return result
 
 
-def cost_of_trial(trial: Trial, folder: Path) -> Cost:
-    """The cost of a trial, without the plain fits of other trials. Raises KeyssError."""
+def cost_of_trial(trial: Trial, folder: Path, read: Callable[[str, ViewOptions], Scene] = as_scene) -> Cost:
+    """The cost of a trial, without the plain fits of other trials. Raises KeyssError.
+
+    `read`: `as_scene`, or one that remembers scenes that trials share.
+    """
     if isinstance(trial.options, FitConfig):
-        scene = as_scene(trial.cover, trial.views, train_pictures=False)
-        return cost_of_fit(scene, trial.options, resolve_device(trial.device))
+        return cost_of_fit(read(trial.cover, trial.views), trial.options, resolve_device(trial.device))
     keys = [f"key {index}" for index, _ in enumerate(trial.secrets)]
     keys = keys if registry.get(trial.method).capabilities.keys else []
-    cost = hide(**_hide_arguments(trial, folder, keys), dry_run=True).cost
+    arguments = _hide_arguments(trial, folder, keys)
+    # The frame of a given model depends on files in the folder of its scene.
+    if arguments["cover_model"] is None and not is_model(trial.cover):
+        arguments["cover"] = read(trial.cover, trial.views)
+    arguments["secrets"] = [
+        secret
+        if secret.model is not None or is_model(secret.scene)
+        else replace(secret, scene=read(secret.scene, trial.views))
+        for secret in arguments["secrets"]
+    ]
+    cost = hide(**arguments, dry_run=True).cost
     assert cost is not None  # a dry run always has a cost
     elsewhere = [seconds for seconds, model in zip_longest(cost.fit_seconds, trial.models) if model]
     measures = _seconds_of(trial.measures, cost.view_seconds, trial.options.fit.max_gaussians)

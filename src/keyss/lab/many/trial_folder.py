@@ -11,6 +11,7 @@ import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,13 @@ from keyss.lab.audits.trial_measures import check_extras
 from keyss.lab.many.trial import MASTER_KEY, RUN, Result, Trial, cost_of_trial, finished_result, run_trial
 from keyss.methods import MethodOptions
 from keyss.progress import Reporter, reporter as default_reporter
-from keyss.runs.files import MODEL
+from keyss.runs.files import MODEL, as_scene
 from keyss.runs.folder import PRIVATE, check_not_published, make_private
 from keyss.runs.planning import Cost
 
 TRIALS = "trials"
 _LOCAL = "local"  # a cluster of this machine
+_SCENES, _READ_SECONDS = 3, 2.0  # scenes of photos that a forecast keeps in memory; to read one, about
 
 
 @dataclass(frozen=True)
@@ -59,10 +61,13 @@ class TrialFolder:
     common: Mapping[str, Any] = field(default_factory=dict)  # fields of all trials
     trials: dict[Path, Trial] = field(default_factory=dict)
 
-    def plain(self, scene: str, config: FitConfig) -> str:
-        """Add the plain fit of a scene; returns its model, relative to the folder of another trial."""
+    def plain(self, scene: str, config: FitConfig, note: str = "") -> str:
+        """Add the plain fit of a scene; returns its model, relative to the folder of another trial.
+
+        `note`: the end of its name, e.g. its seed or what it is for.
+        """
         size = f"{config.iterations:,} steps, {config.max_gaussians:,} Gaussians"
-        name = f"plain model of {Path(scene).name}, {size}, seed {config.seed}"
+        name = f"plain model of {Path(scene).name}, {size}{note and f', {note}'}"
         shared = {field: self.common[field] for field in ("views", "device")}
         return f"../{self._add(Trial(name=name, cover=scene, options=config, **shared)).name}/{RUN}/{MODEL}"
 
@@ -127,15 +132,22 @@ class TrialFolder:
                 outcome_of[outcome.folder] = outcome
         return {folder: outcome_of[folder] for folder in self.trials}
 
-    def forecast(self) -> Forecast:
+    def forecast(self, reporter: Reporter | None = None) -> Forecast:
         """The cost of each trial. Writes nothing."""
         costs, refused = {}, {}
-        for place, trial in self.trials.items():
-            try:
-                if finished_result(trial, place) is None:
-                    costs[place] = cost_of_trial(trial, place)
-            except KeyssError as error:
-                refused[place] = str(error)
+        count = len(self.trials)
+        scenes = {scene for trial in self.trials.values() for scene in (trial.cover, *trial.secrets)}
+        read = lru_cache(_SCENES)(as_scene)
+        with (reporter or default_reporter()).waiting(
+            f"reading {len(scenes)} scenes, and estimating {count} runs", _READ_SECONDS * len(scenes)
+        ) as done:
+            for number, (place, trial) in enumerate(self.trials.items(), start=1):
+                try:
+                    if finished_result(trial, place) is None:
+                        costs[place] = cost_of_trial(trial, place, read)
+                except KeyssError as error:
+                    refused[place] = str(error)
+                done(number / count)
         return Forecast({place: trial.name for place, trial in self.trials.items()}, costs, refused)
 
 
