@@ -83,6 +83,7 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "no cover": (4, "nowhere", lambda f: _hide(f, cover=f / "nowhere")),
     "too few Gaussians": (2, "--channel appended has room", lambda f: [*_hide(f), "--channel", "colours"]),
     "output exists": (5, "--overwrite", lambda f: _hide(f, out=f / "hidden")),
+    "output exists, and no key": (5, "key.txt exists", lambda f: ["reveal", f / STEGO, "-o", f / "key.txt"]),
     "output is a file": (5, "not a folder", lambda f: ["fit", f / "a", "-o", f / "key.txt"]),
     "key file missing": (4, "none.txt", lambda f: _hide(f, key_file=f / "none.txt")),
     "too few key files": (2, "--key-file", lambda f: [*_hide(f), "--secret", f / "b"]),

@@ -110,6 +110,11 @@ def of_other_version(found: int, known: int) -> str:
     return f"secret of version {found}; this program reads version {known}: {cure}"
 
 
+def not_whole(kind: str, found: str) -> InputError:
+    """The error of a file that lacks a part of what its format asks for."""
+    return InputError(f"not a whole {kind}: {found}; download or copy it again")
+
+
 def nearest(word: str, known: Collection[str]) -> str | None:
     """The most similar of the `known` names, None if none is similar."""
     matches = get_close_matches(word[:MAX_LENGTH], sorted(known), n=1, cutoff=0.7)
