@@ -79,6 +79,7 @@ def _reveal_to(folder: Path, out: str) -> list[object]:
 
 ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "unknown layout": (4, "Known layouts", lambda f: ["fit", f / "hidden/private", "-o", f / "out"]),
+    "fit of a model": (4, "found a 3DGS model", lambda f: ["fit", f / STEGO, "-o", f / "out"]),
     "truncated points": (4, "points3D", _fit_truncated),
     "no cover": (4, "nowhere", lambda f: _hide(f, cover=f / "nowhere")),
     "too few Gaussians": (2, "--channel appended has room", lambda f: [*_hide(f), "--channel", "colours"]),

@@ -83,7 +83,8 @@ class HideArguments:
         Path,
         arg(
             metavar="SCENE",
-            help="What everybody will see: folder of posed photos, or model (.ply, .spz, ...).",
+            help="What everybody will see: folder of posed photos, or model (.ply, .spz, ...). Loses secrets "
+            "that it holds.",
         ),
     ]
     secret: Annotated[

@@ -16,7 +16,8 @@ from typing import Any
 
 OPENS_NOTHING = (
     "this key opens nothing here: it may be another key or misspelt; the model may have changed since it was "
-    "published (converted or quantised, moved, scaled, pruned, edited or trained on); or nothing is hidden"
+    "published (converted or quantised, moved, scaled, pruned, edited, trained on or hidden in again); or "
+    "nothing is hidden"
 )
 _PACKAGES = {"ot": "pot", "sklearn": "scikit-learn", "yaml": "pyyaml"}  # module: package, if the names differ
 MAX_LENGTH = 100  # characters of a misspelt name that count
