@@ -100,7 +100,7 @@ def test_resumed_fit_keeps_seed(tmp_path: Path, given: int | None) -> None:
         keyss.fit(scene, config=replace(FIT, seed=given), out=run, reporter=InterruptAt(10))
     seed = _interrupted_seed(run, "config", "seed")
     assert given in (None, seed)
-    with pytest.raises(OutputError, match=rf"config: seed: {seed} then, 8 now"):
+    with pytest.raises(OutputError, match=rf"\(seed: {seed} then, 8 now"):
         keyss.fit(scene, config=replace(FIT, seed=8), out=run, resume=True)
     keyss.fit(scene, config=FIT, out=run, resume=True)
     assert json.loads((run / "private" / "config.json").read_text())["config"]["seed"] == seed

@@ -79,10 +79,12 @@ def _reveal_to(folder: Path, out: str) -> list[object]:
 
 ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
     "unknown layout": (4, "Known layouts", lambda f: ["fit", f / "hidden/private", "-o", f / "out"]),
+    "fit of a model": (4, "found a 3DGS model", lambda f: ["fit", f / STEGO, "-o", f / "out"]),
     "truncated points": (4, "points3D", _fit_truncated),
     "no cover": (4, "nowhere", lambda f: _hide(f, cover=f / "nowhere")),
     "too few Gaussians": (2, "--channel appended has room", lambda f: [*_hide(f), "--channel", "colours"]),
     "output exists": (5, "--overwrite", lambda f: _hide(f, out=f / "hidden")),
+    "output exists, and no key": (5, "key.txt exists", lambda f: ["reveal", f / STEGO, "-o", f / "key.txt"]),
     "output is a file": (5, "not a folder", lambda f: ["fit", f / "a", "-o", f / "key.txt"]),
     "key file missing": (4, "none.txt", lambda f: _hide(f, key_file=f / "none.txt")),
     "too few key files": (2, "--key-file", lambda f: [*_hide(f), "--secret", f / "b"]),

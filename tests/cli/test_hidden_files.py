@@ -64,6 +64,8 @@ def test_hidden_model_file_is_revealed_as_it_was(tmp_path: Path) -> None:
 
 def test_verify(keyss: Run, folder: Path) -> None:
     stego = folder / "out" / "publish" / "model.ply"
+    for command in ("evaluate", "audit"):
+        assert_refused(keyss(command, folder / "out"), 4, f"nothing to evaluate; `keyss verify {stego} ")
     for index, count in enumerate(("3,000 of 3,000", "0")):
         result = keyss("verify", stego, "--key-file", folder / f"key{index}")
         assert (result.status, result.err) == (0, "")

@@ -12,6 +12,7 @@ import pytest
 from cli.harness import METRICS
 from keyss.cli.tables import print_hiding
 from keyss.fitting import ImageQuality
+from keyss.measure import PsnrRange, WrongKeys
 from keyss.runs import HideMetrics
 
 
@@ -88,3 +89,17 @@ def test_every_table_has_a_legend() -> None:
         print_hiding(replace(METRICS, baseline=shorter), brief=True)
     for word in ("bound", "loss", "start", "plain"):
         assert f"; {word}: " in out.getvalue()
+
+
+@pytest.mark.parametrize(("highest", "unlearnt"), [(19.5, True), (12.0, False)])
+def test_secrets_that_no_key_shows(highest: float, unlearnt: bool) -> None:
+    """A short training leaves wrong keys as good as the right one."""
+    wrong = WrongKeys(2, PsnrRange(29, 28, 30), (PsnrRange(11, 10, highest),))
+    rows = table(replace(METRICS, wrong_key=wrong, chance_level=(10.0,)))
+    assert (["Wrong keys show as much of the secret as its key: train longer."] in rows) == unlearnt
+
+
+def test_renders_of_models_are_rounded() -> None:
+    """As 8-bit values, a model against itself does not exceed this."""
+    renders = table(replace(METRICS, photos=(False, False)))
+    assert renders[3] == ["PSNR in dB. Equal renders, rounded to 8 bits, have 58.92 dB."]

@@ -24,7 +24,7 @@ def test_invalid_models(keyss: Run, tmp_path: Path) -> None:
     for command in (["view"], ["view", "-o", str(tmp_path / "page.html")]):
         assert_refused(keyss(*command, str(tmp_path / "model.txt")), 4, "expected a 3DGS model")
         assert_refused(keyss(*command, str(tmp_path / "text.ply")), 4, "not a 3DGS model")
-        assert_refused(keyss(*command, str(tmp_path / "cut.ply")), 4, "not a whole .ply file")
+        assert_refused(keyss(*command, str(tmp_path / "cut.ply")), 4, "; download or copy it again")
         assert_refused(keyss(*command, str(tmp_path / "nowhere.ply")), 4, "nowhere.ply does not exist")
         assert_refused(keyss(*command, str(tmp_path)), 4, "found a folder")
     assert_refused(keyss("view", str(tmp_path / "model.txt"), "--port", "70000"), 2, "--port")

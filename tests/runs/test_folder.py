@@ -111,13 +111,14 @@ def test_existing_folder(tmp_path: Path) -> None:
 
 
 def test_resume(tmp_path: Path) -> None:
-    arguments: dict[str, object] = {"width": 200, "options": {"seed": 0, "fit": {"iterations": 10}}}
+    options = {"seed": 0, "iterations": 10, "fit": {"iterations": 10}}
+    arguments: dict[str, object] = {"width": 200, "options": options}
     interrupt(tmp_path, arguments)
     assert read_files(tmp_path) == {"private/checkpoint/fit": b"state"}
     with pytest.raises(OutputError, match=r"interrupted run.*`resume=True`"):
         RunFolder(tmp_path, "hide", arguments)
-    other = {"width": 160, "options": {"seed": 0, "fit": {"iterations": 20}}}
-    with pytest.raises(OutputError, match="iterations: 10 then, 20 now; width: 200 then, 160 now"):
+    other = {"width": 160, "options": {"seed": 0, "iterations": 20, "fit": {"iterations": 20}}}
+    with pytest.raises(OutputError, match=r"\(iterations: 10 then, 20 now; width: 200 then, 160 now\)"):
         RunFolder(tmp_path, "hide", other, resume=True)
     with pytest.raises(OutputError, match="of another kind"):
         RunFolder(tmp_path, "fit", arguments, resume=True)

@@ -8,7 +8,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from keyss.core.errors import InputError
 from keyss.core.scene import Scene, ViewOptions
+from keyss.files.models import is_model_source
 from keyss.fitting.config import FitConfig, preset_for
 from keyss.fitting.image_metrics import quality
 from keyss.fitting.plain import FitResult, fit_scene
@@ -51,6 +53,8 @@ def fit(
     `config.json` records. Raises KeyssError, and Interrupted on Ctrl-C.
     """
     started = time.monotonic()
+    if not isinstance(scene, Scene) and is_model_source(scene):
+        raise InputError(f"{scene}: expected a folder of posed photos, found a 3DGS model")
     interrupted = Path(out) if resume and out is not None else None
     target = resolve_device(device)
     config = with_seed(config or preset_for("default", target.type), interrupted, "config")

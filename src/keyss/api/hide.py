@@ -135,6 +135,7 @@ def hide(
         if not resume and (prepared.grows or trains):
             for note in (
                 f"hide: a file of up to {prepared.plan.megabytes:,.1f} MB, {cost}",
+                *([prepared.plan.room] if prepared.plan.prunes else []),
                 *prepared.plan.notes,
             ):
                 reporter.note(note)

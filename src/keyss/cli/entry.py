@@ -76,6 +76,7 @@ def _run(arguments: list[str], options: set[str]) -> None:
     import tyro
 
     from keyss.cli import command_table
+    from keyss.cli.arguments import flag
 
     if arguments in (["--help"], ["-h"]):
         print(command_table.help_page())
@@ -101,6 +102,10 @@ def _run(arguments: list[str], options: set[str]) -> None:
         for option, cure in _QUICKER.items():
             if option in options:
                 raise UsageError(f"`keyss {name}` has no option --quick: {cure}")
+    known = {"--help", *map(flag, options)}
+    for given in (word.partition("=")[0].replace("_", "-") for word in rest):
+        if given.startswith("--") and given not in known and (near := nearest(given, known)):
+            raise UsageError(f"`keyss {name}` has no option {given}: did you mean {near}?")
     tyro.cli(command, prog=f"keyss {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))
 
 

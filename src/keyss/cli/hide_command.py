@@ -83,7 +83,8 @@ class HideArguments:
         Path,
         arg(
             metavar="SCENE",
-            help="What everybody will see: folder of posed photos, or model (.ply, .spz, ...).",
+            help="What everybody will see: folder of posed photos, or model (.ply, .spz, ...). Loses secrets "
+            "that it holds.",
         ),
     ]
     secret: Annotated[
@@ -210,14 +211,14 @@ def _print_result(args: HideArguments, result: HideResult) -> None:
     published = [args.out / name for name in STEGOS if (args.out / name).exists()]
     size = f", {sum(path.stat().st_size for path in published) / 1e6:,.1f} MB"
     files = dict.fromkeys(STEGOS, _HOW_TO_PUBLISH[result.survives] + what + size)
-    if result.metrics is None:
-        files["private"] = "lists what --overwrite may replace"
-    else:
+    private = "the list of files that --overwrite may replace"
+    if result.metrics is not None:
+        private = "measurements, configuration, fitted models if any"
         files |= {
             LOOK: "cover before and after, secret and revealed: look here first; it shows the secret",
             COMPANIONS: "hand this over to whoever may see the secret: `keyss reveal --companion`",
-            "private": "keep this private, or delete it: measurements, configuration, fitted models if any",
         }
+    files["private"] = f"keep this private, or delete it: {private}"
     print_files(args.out, files)
     if not method.capabilities.keys:
         progress.say(f"The method {method.name} has no keys: whoever has both files can see the secret.")

@@ -10,6 +10,8 @@ from tyro.conf import Positional, arg
 from keyss.cli.arguments import Device, KeyFilesToCheck, OneKeyFile, Overwrite, check_exists, optional, switch
 from keyss.cli.keys import given_keys, keys
 from keyss.core.errors import InputError
+from keyss.files.atomic import check_not_an_input, check_output_file
+from keyss.files.inputs import is_standard
 
 
 def reveal(
@@ -47,6 +49,9 @@ def reveal(
     example: keyss reveal - --key-file key.txt -o - < model.ply > revealed.ply
     """
     check_exists(stego, companion, *key_file)
+    if not is_standard(out):  # before a key is asked for and torch is imported
+        check_not_an_input(out, [stego])
+        check_output_file(out, overwrite)
     import keyss
 
     key: str | None = None

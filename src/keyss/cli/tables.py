@@ -41,6 +41,8 @@ _HEADS = {
     "plain": "plain: Gaussians of the plain model",
     "steps": "",
 }
+_ROUNDED = 20 * math.log10(255 * math.sqrt(12))  # PSNR of the error of rounding to 8 bits
+_SHOWS = 1.0  # dB below the secret at which a wrong key shows as much
 
 
 class Console(RichConsole):
@@ -63,7 +65,8 @@ def print_hiding(metrics: HideMetrics, *, brief: bool = False) -> None:
     table = [[name, *(row.get(head, "") for head in heads)] for name, row in zip(first, rows, strict=True)]
     print_table([views, *heads], table)
     wrong_keys = [] if brief else _lines_on_wrong_keys(metrics, names)
-    lines = [_legend(heads), *wrong_keys, *_lines_on_files(metrics, names)]
+    rounded = "" if all(metrics.photos) else f" Equal renders, rounded to 8 bits, have {_ROUNDED:.2f} dB."
+    lines = [_legend(heads) + rounded, *wrong_keys, *_lines_on_files(metrics, names)]
     if not brief:
         units = {"capacity": "Gaussians", "capacity_bytes": "bytes"}
         capacities = {unit: metrics.details[name] for name, unit in units.items() if name in metrics.details}
@@ -112,14 +115,10 @@ def print_plan(method: str, plan: Plan, cost: Cost) -> None:
     """Print capacity and estimates of a run."""
     of = [f"{role_of(index, len(cost.steps))} {steps:,}" for index, steps in enumerate(cost.steps)]
     training = [("training", f"steps: {', '.join(of)}")] if any(cost.steps) else []
-    rough = "about " if plan.capacity < plan.secret_gaussians else ""
     _print_columns(
         [
             ("method", method),
-            (
-                "capacity",
-                f"room for {rough}{plan.capacity:,} of the {plan.secret_gaussians:,} Gaussians to hide",
-            ),
+            ("capacity", plan.room),
             (
                 "published",
                 f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, {plan.megabytes:,.1f} MB",
@@ -142,9 +141,12 @@ def _lines_on_wrong_keys(metrics: HideMetrics, names: Sequence[str]) -> list[str
     highest = ", ".join(f"{psnrs.max:.2f} to the {name}" for name, psnrs in pairs)
     cover = f"{wrong.vs_cover.mean:.2f} to the cover, at least {wrong.vs_cover.min:.2f}"
     chance = ", ".join(f"{psnr:.2f}" for psnr in metrics.chance_level)
+    scenes = zip(names[1:], wrong.vs_secrets, metrics.secrets, strict=True)
+    unlearnt = [name for name, psnrs, quality in scenes if psnrs.max > quality.psnr - _SHOWS]
     return [
         f"PSNR of {wrong.keys} wrong keys: on average {cover}; at most {highest}.",
         f"Chance level: {chance}, the published model's PSNR to the secret; `keyss audit` judges by it.",
+        *(f"Wrong keys show as much of the {name} as its key: train longer." for name in unlearnt),
     ]
 
 

@@ -16,7 +16,8 @@ from typing import Any
 
 OPENS_NOTHING = (
     "this key opens nothing here: it may be another key or misspelt; the model may have changed since it was "
-    "published (converted or quantised, moved, scaled, pruned, edited or trained on); or nothing is hidden"
+    "published (converted or quantised, moved, scaled, pruned, edited, trained on or hidden in again); or "
+    "nothing is hidden"
 )
 _PACKAGES = {"ot": "pot", "sklearn": "scikit-learn", "yaml": "pyyaml"}  # module: package, if the names differ
 MAX_LENGTH = 100  # characters of a misspelt name that count
@@ -108,6 +109,11 @@ def of_other_version(found: int, known: int) -> str:
     """The message about a secret of another version than this program reads."""
     cure = "update keyss" if found > known else "open it with the keyss that wrote it, and hide it again"
     return f"secret of version {found}; this program reads version {known}: {cure}"
+
+
+def not_whole(kind: str, found: str) -> InputError:
+    """The error of a file that lacks a part of what its format asks for."""
+    return InputError(f"not a whole {kind}: {found}; download or copy it again")
 
 
 def nearest(word: str, known: Collection[str]) -> str | None:

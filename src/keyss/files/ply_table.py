@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from keyss.core.arrays import Floats, Numbers
-from keyss.core.errors import InputError, KeyssWarning
+from keyss.core.errors import InputError, KeyssWarning, not_whole
 
 _MAX_HEADER_BYTES = 64 * 1024
 _CHUNK_BYTES, _TEXT_BYTES = 1 << 20, 1 << 16
@@ -147,7 +147,7 @@ def _read_header(file: BinaryIO) -> tuple[list[_Element], list[str]]:
         raise InputError("expected a .ply file, but it does not begin with a line 'ply'")
     end = re.search(rb"^end_header\r*\n", start, re.MULTILINE)
     if end is None and len(start) < _MAX_HEADER_BYTES:
-        raise InputError("not a whole .ply file: it ends inside the header")
+        raise not_whole(".ply file", "it ends inside the header")
     if end is None:
         raise InputError(f"header is longer than {_MAX_HEADER_BYTES} bytes")
     file.seek(end.end())
@@ -190,9 +190,10 @@ def _check_size(file: BinaryIO, needed: int, vertex: _Element) -> None:
     left = file.seek(0, os.SEEK_END) - start
     file.seek(start)
     if needed > left:
-        raise InputError(
-            f"not a whole .ply file: the header announces {vertex.count:,} vertices, which take at "
-            f"least {needed:,} bytes, but only {left:,} follow it"
+        raise not_whole(
+            ".ply file",
+            f"the header announces {vertex.count:,} vertices, which take at "
+            f"least {needed:,} bytes, but only {left:,} follow it",
         )
 
 
@@ -203,7 +204,7 @@ def _binary_blocks(file: BinaryIO, vertex: _Element) -> Iterator[Table]:
         size = min(step, vertex.count - start) * dtype.itemsize
         data = file.read(size)
         if len(data) != size:
-            raise InputError("not a whole .ply file: it ends inside the data")
+            raise not_whole(".ply file", "it ends inside the data")
         yield np.frombuffer(data, dtype)
 
 

@@ -213,6 +213,17 @@ class Plan:
         """Size of the published model as a .ply with normals; other formats take less."""
         return 4e-6 * self.gaussians * (14 + 3 * (self.sh_degree + 1) ** 2)
 
+    @property
+    def prunes(self) -> bool:
+        """Whether secrets lose Gaussians."""
+        return self.capacity < self.secret_gaussians
+
+    @property
+    def room(self) -> str:
+        """What fits, as a phrase."""
+        rough = "about " if self.prunes else ""
+        return f"room for {rough}{self.capacity:,} of the {self.secret_gaussians:,} Gaussians to hide"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Prepared:

@@ -14,7 +14,7 @@ from keyss.files.file_kinds import identify_file
 from keyss.files.model_formats import DECODED_SUFFIX, known_suffixes
 from keyss.files.models import is_model_source, read_model
 from keyss.methods.companion import SUFFIX
-from keyss.runs.folder import CHECKPOINTS, PRIVATE, PUBLISH
+from keyss.runs.folder import CHECKPOINTS, HIDE_FILES, MANIFEST, PRIVATE, PUBLISH, read_manifest
 
 STEGO = f"{PUBLISH}/model.ply"  # an innocuous name
 STEGOS = (STEGO, *(f"{PUBLISH}/model{suffix}" for suffix in (*SUFFIXES.values(), DECODED_SUFFIX)))
@@ -65,6 +65,11 @@ def run_folder(path: Path) -> Path:
         problem = f"{kind} in one; give {run}" if run else f"no {CONFIG} in it ({error.strerror})"
         if os.path.isdir(path / CHECKPOINTS):
             problem = f"an interrupted one, which `keyss info {path}` describes"
+        if os.path.isfile(path / MANIFEST) and HIDE_FILES in read_manifest(path).files:
+            raise InputError(
+                f"{path}: this run hid files, and there is nothing to evaluate; `keyss verify "
+                f"{stego_in(path)} --key-file KEY` checks them"
+            ) from error
     raise InputError(
         f"{path}: expected the folder of a run, as `keyss hide --secret` writes it, found {problem}"
     )

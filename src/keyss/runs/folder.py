@@ -124,12 +124,13 @@ class RunFolder:
             raise OutputError(f"{self.path} holds {content}, and no interrupted run that could be resumed")
         elif in_use == {self.stage} and self.onto and not overwrite:
             raise OutputError(
-                f"{self.path} has a finished {self.stage} already: `overwrite=True` replaces it and nothing "
-                "else"
+                f"{self.path} has a finished {self.stage} already: `overwrite=True` replaces it and keeps "
+                "all other files"
             )
         elif in_use and not overwrite:
             raise OutputError(
-                f"{self.path} exists: choose another folder, or `overwrite=True` to replace what keyss wrote"
+                f"{self.path} exists: choose another folder, or `overwrite=True` to replace what keyss wrote "
+                "there and keep all other files"
             )
 
     def _has_files(self) -> bool:
@@ -153,7 +154,7 @@ class RunFolder:
             before = running.arguments | {"keys": self.arguments.get("keys")}
             if before == self.arguments or "keys" not in self.arguments:  # verifiers depend on the others
                 before = running.arguments
-            changes = _differences(before, self.arguments)
+            changes = "; ".join(_differences(before, self.arguments))
             raise OutputError(
                 f"{self.path} holds an interrupted run with other arguments ({changes}): give the same ones, "
                 "or start anew with `overwrite=True`"
@@ -392,13 +393,18 @@ def _remove_empty(folder: Path) -> None:
         folder.rmdir()
 
 
-def _differences(old: Any, new: Any) -> str:
-    """The values that differ, down to the innermost fields."""
-    if isinstance(old, dict) and isinstance(new, dict):
-        names = [name for name in sorted({*old, *new}) if old.get(name) != new.get(name)]
-        return "; ".join(f"{name}: {_differences(old.get(name), new.get(name))}" for name in names)
-    shown = ["none" if value is None else msgspec.json.encode(value).decode() for value in (old, new)]
-    return "not the same" if max(map(len, shown)) > _MAX_SHOWN else f"{shown[0]} then, {shown[1]} now"
+def _differences(old: dict[str, Any], new: dict[str, Any]) -> dict[str, None]:
+    """The innermost fields that differ, in order; equal changes of fields of one name once."""
+    changes: dict[str, None] = {}
+    for name in sorted({*old, *new}):
+        pair = before, now = old.get(name), new.get(name)
+        if isinstance(before, dict) and isinstance(now, dict):
+            changes |= _differences(before, now)
+        elif before != now:
+            shown = ["none" if value is None else msgspec.json.encode(value).decode() for value in pair]
+            brief = max(map(len, shown)) <= _MAX_SHOWN
+            changes[f"{name}: " + (f"{shown[0]} then, {shown[1]} now" if brief else "not the same")] = None
+    return changes
 
 
 @contextmanager

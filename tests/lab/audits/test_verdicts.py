@@ -31,6 +31,9 @@ from keyss.measure import PsnrRange, WrongKeys
 )
 def test_quality(psnr: float, plain: float, word: str) -> None:
     assert quality_verdict("secret", psnr, plain, "missed").word == word
+    assert quality_verdict("secret", psnr, plain, "missed", 150).beside.endswith(
+        "plain model of only 150 steps"
+    )
 
 
 def test_wrong_keys() -> None:

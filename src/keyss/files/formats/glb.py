@@ -23,7 +23,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from keyss.core.arrays import Doubles, Numbers
-from keyss.core.errors import InputError
+from keyss.core.errors import InputError, not_whole
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.file_kinds import FIT
@@ -201,8 +201,10 @@ def _chunks(data: bytes) -> tuple[_Document, memoryview]:
     if len(data) < _HEADER.size or not data.startswith(_MAGIC):
         raise InputError("not a .glb: it does not begin with glTF")
     _, version, size = _HEADER.unpack_from(data)
-    if version != 2 or size > len(data):
-        raise InputError("not a whole .glb of glTF 2.0")
+    if version != 2:
+        raise InputError(f"expected version 2 of glTF, found version {version}")
+    if size > len(data):
+        raise not_whole(".glb", f"expected {size:,} bytes, found {len(data):,}")
     chunks: list[memoryview] = []
     at = _HEADER.size
     for kind in (_JSON, _BIN):
@@ -210,7 +212,7 @@ def _chunks(data: bytes) -> tuple[_Document, memoryview]:
         length, name = _CHUNK.unpack_from(data, at) if start <= len(data) else (0, b"")
         at = start + length
         if name != kind or at > len(data):
-            raise InputError("not a whole .glb: a chunk is missing, cut short, or out of place")
+            raise not_whole(".glb", "a chunk is missing, cut short, or out of place")
         chunks.append(memoryview(data)[start:at])
     if len(chunks[0]) > _MAX_JSON_BYTES:
         raise InputError(f"expected JSON of at most {_MAX_JSON_BYTES:,} bytes, found {len(chunks[0]):,}")

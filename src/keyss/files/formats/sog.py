@@ -23,7 +23,7 @@ import numpy as np
 from PIL import Image
 
 from keyss.core.arrays import Bytes, Doubles, Floats, Numbers, Shorts
-from keyss.core.errors import InputError
+from keyss.core.errors import InputError, not_whole
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.codebooks import SIZE, codebook_of, nearest, palette_of
 from keyss.files.formats.common import (
@@ -307,7 +307,7 @@ def _open_archive(data: bytes) -> Callable[[str], bytes]:
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
     except _BROKEN as error:
-        raise InputError(f"not a whole SOG: {reason(error)}") from error
+        raise not_whole("SOG", reason(error)) from error
     members = archive.infolist()
     if len(members) > _MAX_MEMBERS:
         raise InputError(f"expected a SOG of at most {_MAX_MEMBERS} files, found {len(members):,}")

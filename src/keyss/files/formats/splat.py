@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from keyss.core.errors import InputError
+from keyss.core.errors import not_whole
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import (
     arrays_of,
@@ -33,7 +33,7 @@ _ROW = np.dtype(
 def read(data: bytes) -> Gaussians:
     """The model in a file, of SH degree 0. Raises InputError."""
     if not data or len(data) % _ROW.itemsize:
-        raise InputError(f"not a whole .splat: expected 32 bytes per Gaussian, found {len(data):,} in total")
+        raise not_whole(".splat", f"expected 32 bytes per Gaussian, found {len(data):,} in total")
     rows = np.frombuffer(data, _ROW)
     return assembled(len(rows), (_gaussians(rows[part]) for part in blocks_of(len(rows))), drop=True)
 

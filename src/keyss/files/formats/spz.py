@@ -21,7 +21,7 @@ import numpy.typing as npt
 import zstandard
 
 from keyss.core.arrays import Bytes, Floats, Shorts
-from keyss.core.errors import InputError, KeyssWarning, OutputError
+from keyss.core.errors import InputError, KeyssWarning, OutputError, not_whole
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import (
     MIN_BYTES,
@@ -89,7 +89,7 @@ class _Header(NamedTuple):
     def parse(start: bytes, size: int) -> _Header:
         """The header of a file of `size` bytes. Raises InputError."""
         if len(start) < _START.size or not start.startswith(NGSP):
-            raise InputError("not a whole SPZ file: it ends inside the header, or does not begin with NGSP")
+            raise not_whole("SPZ file", "it ends inside the header, or does not begin with NGSP")
         header = _Header._make(_START.unpack_from(start))
         check_count(header.gaussians, size, MIN_BYTES + check_sh_degree(header.sh_degree) / 4)
         if header.fractional_bits > MAX_FRACTIONAL_BITS:
@@ -148,9 +148,7 @@ def _unpack_gzip(data: bytes) -> tuple[_Header, bytes, bytes]:
         raise InputError(f"damaged SPZ: {reason(error)}") from error
     if len(body) < size or not stream.eof:
         found = "fewer" if len(body) < size or not stream.unconsumed_tail else "more"
-        raise InputError(
-            f"not a whole SPZ: expected {size:,} bytes of {header.gaussians:,} Gaussians, found {found}"
-        )
+        raise not_whole("SPZ", f"expected {size:,} bytes of {header.gaussians:,} Gaussians, found {found}")
     return header, body[:size], body[size:] if header.flags & EXTENSIONS else b""
 
 
@@ -165,11 +163,11 @@ def _unpack_zstd(data: bytes) -> tuple[_Header, bytes, bytes]:
     at = int.from_bytes(data[_START.size : _START.size + 4], "little")
     start = at + len(sizes) * _ENTRY.size
     if at < _START.size + _PLACE.size or start > len(data):
-        raise InputError("not a whole SPZ: its table lies outside of it")
+        raise not_whole("SPZ", "its table lies outside of it")
     sections = []
     for size, (packed, unpacked) in zip(sizes, _ENTRY.iter_unpack(data[at:start]), strict=True):
         if unpacked != size or start + packed > len(data):
-            raise InputError("not a whole SPZ: its table and its streams do not agree")
+            raise not_whole("SPZ", "its table and its streams do not agree")
         sections.append(_zstd(data[start : start + packed], size))
         start += packed
     return header, b"".join(sections), data[_START.size + _PLACE.size : at]
@@ -184,7 +182,7 @@ def _zstd(packed: bytes, size: int) -> bytes:
     except zstandard.ZstdError as error:
         raise InputError(f"damaged SPZ: {reason(error)}") from error
     if len(body) != size:
-        raise InputError(f"not a whole SPZ: expected a stream of {size:,} bytes, found {len(body):,}")
+        raise not_whole("SPZ", f"expected a stream of {size:,} bytes, found {len(body):,}")
     return body
 
 

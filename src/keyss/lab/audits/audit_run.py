@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from keyss.core import InputError, Interrupted, UsageError, import_extra, signal_of
+from keyss.core import (
+    BackendError,
+    InputError,
+    Interrupted,
+    KeyssWarning,
+    UsageError,
+    import_extra,
+    signal_of,
+)
 from keyss.files import write_bytes
 from keyss.lab.audits.parts import PARTS, Part, Progress
 from keyss.lab.audits.record import Audit
@@ -62,8 +71,7 @@ def audit(
     """
     if controls < 2:
         raise UsageError(f"expected at least 2 plain models to compare with, got {controls}")
-    for module in EXTRA:
-        import_extra(module, "audit", "audit a run")
+    _check_extras()
     _, config, *_ = read_run(Path(run))
     parts = _chosen(only, config.method)
     started, reporter = time.monotonic(), reporter or Reporter()
@@ -124,6 +132,11 @@ def audit(
     return result
 
 
+def _check_extras() -> None:
+    for module in EXTRA:
+        import_extra(module, "audit", "audit a run")
+
+
 def _earlier(run: Path, controls: tuple[int, ...]) -> Audit | None:
     """The finished audit of a run with these controls, if there is one."""
     with suppress(InputError):
@@ -149,7 +162,14 @@ def _chosen(only: Sequence[str], method: str) -> dict[str, Part]:
 def forecast_audit(
     run: PathLike, *, controls: int = 3, only: Sequence[str] = (), device: Backend = "auto"
 ) -> dict[str, float]:
-    """About the seconds of each part of an audit, and of the training of its controls; needs no keys."""
+    """About the seconds of each part of an audit, and of the training of its controls; needs no keys.
+
+    Warns (KeyssWarning) without the extra `audit`.
+    """
+    try:
+        _check_extras()
+    except BackendError as error:
+        warnings.warn(str(error), KeyssWarning, stacklevel=2)
     _, config, metrics, sources = read_run(Path(run))
     parts, target = _chosen(only, config.method), resolve_device(device)
     scenes = [as_scene(source, config.views, train_pictures=False) for source in sources]

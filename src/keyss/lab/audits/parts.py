@@ -83,7 +83,10 @@ def images(subject: Subject, seed: int, progress: Progress) -> tuple[Section, Pi
         pictures[name] = contact_sheet(list(columns), by_view, cell=300)
         if len(psnrs) == 2:
             where = f"{name} on {'test photos' if photos else 'renders of its model'}"
-            verdicts.append(quality_verdict(where, psnrs[0], psnrs[1], "missed" if index else "visible"))
+            baseline = subject.run.metrics.baseline
+            word: Word = "missed" if index else "visible"
+            steps = None if baseline.equal[index] else baseline.steps[index]
+            verdicts.append(quality_verdict(where, psnrs[0], psnrs[1], word, steps))
     metrics = subject.run.metrics
     if metrics.wrong_key is not None:
         verdicts += wrong_key_verdicts(metrics.wrong_key, metrics.chance_level)
@@ -97,10 +100,13 @@ def _renders(model: Gaussians, scene: Scene) -> list[Any]:
     return [image.numpy() for _, image in renders]
 
 
-def quality_verdict(measure: str, psnr: float, plain: float, otherwise: Word) -> Verdict:
-    """The PSNR of a scene beside that of its plain model; both in dB."""
+def quality_verdict(
+    measure: str, psnr: float, plain: float, otherwise: Word, steps: int | None = None
+) -> Verdict:
+    """PSNRs of a scene and its plain model, in dB. `steps`: of a plain model with fewer than the scene."""
     limit = min(plain - QUALITY_LOSS, INVISIBLE)
-    value, beside, least = f"{psnr:.2f} dB", f"{plain:.2f} dB, plain model", f"at least {limit:.2f} dB"
+    model = "plain model" if steps is None else f"plain model of only {steps:,} steps"
+    value, beside, least = f"{psnr:.2f} dB", f"{plain:.2f} dB, {model}", f"at least {limit:.2f} dB"
     return Verdict(measure, value, beside, least, "fine" if psnr >= limit else otherwise)
 
 
