@@ -124,9 +124,7 @@ def test_default_budget_and_lock(folders: tuple[Path, Path], tmp_path: Path) -> 
     """The default budget is that of the first method's preset."""
     found = compare(*folders, methods=["carry:quick", "3dgs"], out=tmp_path / "out", dry_run=True)
     assert isinstance(found, Forecast)
-    assert {name.partition(", ")[2] for name in found.names.values()} >= {
-        "500 steps, 10,000 Gaussians, seed 0"
-    }
+    assert {name.partition(", ")[2] for name in found.names.values()} >= {"500 steps, 10,000 Gaussians"}
     assert len({*found.names.values()}) == len(found.names)
     with claim_folder(tmp_path / "out"), pytest.raises(OutputError, match="another process"):
         compare(*folders, methods=["carry:quick"], out=tmp_path / "out")
