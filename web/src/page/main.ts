@@ -170,7 +170,7 @@ class Page {
       else this.searcher.stop(); // frees its memory
       const news = this.show(answer);
       if (said && !news) return;
-      said += news;
+      said = [said, news].filter(Boolean).join(' ');
       this.say(said || (search === 'quick' ? SEARCHING : answer.stopped ? STOPPED : NOTHING));
       await this.settle();
       if (work !== this.work) return;

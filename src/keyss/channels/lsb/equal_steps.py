@@ -204,7 +204,7 @@ def _sweep(first: Any, second: Any, cells: Any, found: Any) -> int:
 
 @kernel
 def _drop_mutual(rows: Any, others: Any) -> None:
-    """Replace neighbours of which a Gaussian is a neighbour, too, and comes first, by _NOTHING."""
+    """Keep each pair of mutual neighbours once, in the first row: the other one gets _NOTHING."""
     for one in rows:
         for each in range(2, others.shape[1]):
             other = others[one, each]
