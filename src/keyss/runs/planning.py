@@ -28,6 +28,7 @@ _CHECKPOINT = 3  # checkpoint / model: parameters and two moments of Adam
 _MAX_APPENDED = 7  # Gaussians that hold one Gaussian of a secret of SH degree 3
 _COPIES = 1  # of what is published and of the secrets in memory, beside the given models
 _SHARDS = 7  # copies of appended Gaussians: their shards, coded, placed and read again
+_LONG = 60.0  # seconds; shorter work ends before its cost is read
 _OTHER_BYTES = 2 << 20  # pictures, JSON files, locks
 
 
@@ -43,6 +44,11 @@ class Cost:
     device: str  # "cpu" or "cuda"
     disk_bytes: int  # at one time, checkpoints included
     memory_bytes: int
+
+    @property
+    def is_long(self) -> bool:
+        """Whether to announce it."""
+        return self.seconds > _LONG
 
     @property
     def where(self) -> str:
