@@ -27,7 +27,7 @@ OPTIONS = CarryOptions(fit=FitConfig(iterations=400, max_gaussians=10_000, evalu
 WRONG_KEYS = ("open sesame", "0000000000000000", "Demo-key")
 SECRET_PLY, WEB, COMPARISON, KEY, SCENES = "secret.ply", "web.spz", "comparison.png", "key.txt", "scenes"
 VIEWER = "index.html"
-_OPEN_SECONDS = 12.0  # of opening the published files and comparing their pictures
+_OPEN_SECONDS = 12.0  # to open the published files and compare their pictures
 
 
 @dataclass(frozen=True)

@@ -139,7 +139,7 @@ def _check(
             raise ValueError(f"{name}: expected 1 to {MAX_SIDE} pixels, got {side}")
     if not 0 < near_plane < _FAR_PLANE:
         raise ValueError(f"near_plane: expected 0 to {_FAR_PLANE:g}, got {near_plane}")
-    if tensors["means"].device.type != "cpu":  # on a GPU the other checks would wait for it
+    if tensors["means"].device.type != "cpu":  # checks of values would wait for a GPU
         return
     # Numbers that affect every pixel; invalid Gaussians are only skipped.
     for name, limit in (("viewmat", CAMERA_MAX), ("K", CAMERA_MAX), ("background", float(CHANNEL_MAX))):

@@ -54,7 +54,7 @@ class ModelInfo:
     sh_degree: int
     bounding_box: tuple[tuple[float, ...], tuple[float, ...]]  # two corners, in world units
     nearly_transparent: float  # share of the Gaussians with opacities below 0.05
-    capacity: tuple[str, ...] | None = None  # of each way to publish; only on request, as it takes seconds
+    capacity: tuple[str, ...] | None = None  # one per way to publish; only on request, as it takes seconds
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ export interface CompressedPlyCodes {
   readonly count: number;
   readonly shDegree: number;
   readonly placeBounds: Bounds;
-  readonly scaleBounds: Bounds; // of log scales
+  readonly scaleBounds: Bounds; // bounds of log scales
   readonly colourBounds: Bounds;
   readonly positions: Float64Array; // [N] 11, 10 and 11 bits between the bounds
   readonly scales: Float64Array; // [N] 11, 10 and 11 bits

@@ -36,9 +36,9 @@ WORD_BITS = INVARIANT_BITS + 3 * (POSITION_BITS + ROTATION_BITS)
 # deviation from the centre. At 1.1/255, 360,000 of them would lower the cover to 40 dB.
 _OPACITY = 1.00001 * DRAWN_OPACITY
 _LOGIT = math.log(_OPACITY / (1 - _OPACITY))
-_FAINTEST, _STRONGEST = 0.4 * DRAWN_OPACITY, 1.6 * DRAWN_OPACITY  # after rounding
+_FAINTEST, _STRONGEST = 0.4 * DRAWN_OPACITY, 1.6 * DRAWN_OPACITY  # opacities of words after rounding
 _COLOUR_STEP = 0.0275  # a little above twice the largest rounding error of formats
-_SCALE_STEP = 0.08  # the same for log scales
+_SCALE_STEP = 0.08  # of log scales; also above twice the largest rounding error
 _MIN_LOG_SCALE = -9.9  # `.spz` stores -10 and more
 _SMALL = -9.0  # smallest log scale, relative to the cube's
 # Bound of x, y and z, so that w is the largest. A step is 16 of `.spz`, which compress better.

@@ -81,7 +81,7 @@ def coarse_lengths(quats: Words32) -> Doubles:
 def gaussian_ids(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
     """[N, 16] IDs of the Gaussians: public hashes (BLAKE2b) of the bits that embedding never changes."""
     columns = (layout or Layout.of(gaussians)).columns
-    stays = np.full(8 + 3 * gaussians.sh.shape[1], ~np.uint32(0))  # of positions and `used_words`
+    stays = np.full(8 + 3 * gaussians.sh.shape[1], ~np.uint32(0))  # masks of unchanged bits
     stays[3 + columns] = ~LOW | np.uint32(1)
 
     def ids(start: int, stop: int) -> Bytes:

@@ -29,17 +29,17 @@ from keyss.kernels.jit import inline, kernel
 from keyss.kernels.parallel import in_blocks
 
 _NEIGHBOURS = 8  # most siblings; detectors that look at 12 find no more than with 12 here
-_EQUAL = 3  # numbers
-_PARTNERS, _WINDOW = 2, 1 << 8  # of a Gaussian among distant ones, and how many are looked at
-_ROWS = 1 << 11  # that a thread takes at a time
+_EQUAL = 3  # equal steps that exclude a Gaussian
+_PARTNERS, _WINDOW = 2, 1 << 8  # distant siblings per Gaussian, and candidates for them
+_ROWS = 1 << 11  # rows per batch of a thread
 _SAMPLE = 8000  # Gaussians whose pairs of numbers are tested
 _DRAWS = 16
-_PARTS = np.array([[1 / 16], [1 / 8], [1 / 4]])  # of a cell
+_PARTS = np.array([[1 / 16], [1 / 8], [1 / 4]])  # tested distances, in cells
 _ZERO, _COLOURS, _NOTHING = -1, -2, -3  # what a Gaussian is compared with, instead of another one
 _KINDS = _GEOMETRY, _HARMONICS, _BETWEEN_COLOURS = 0, 1, 2
 _FIRST = 16  # place of the harmonics of degrees 1 to 3 among a Gaussian's numbers
-_LANES = 48  # room for them
-_BLOCK = 16  # points that a sweep looks at at once
+_LANES = 48  # padded number of these harmonics
+_BLOCK = 16  # points of a sweep that are compared at a time
 _NAN, _EXPONENT, _MAGNITUDE = np.uint32(0x7FC00000), np.uint32(0x7F800000), np.uint32(0x7FFFFFFF)
 
 
@@ -53,7 +53,7 @@ class Steps:
         means = np.nan_to_num(doubles(gaussians.means), posinf=0, neginf=0)
         near = min(_NEIGHBOURS, max(0, len(means) - 1))
         self.order = morton_order(means.astype(np.float32))  # what neighbours share stays in the cache
-        self.others = np.full((len(means), 2 + near), _ZERO, np.int32)  # that a Gaussian is compared with
+        self.others = np.full((len(means), 2 + near), _ZERO, np.int32)  # candidates for siblings
         self.others[:, 1] = _COLOURS
         if near:
             tree = Neighbours(means, near + 1)

@@ -53,7 +53,7 @@ OVERHEAD = MAX_OVERHEAD + EXACT_BYTES
 class Share:
     """Carriers of a secret at a depth, and the codewords in them."""
 
-    part: float  # of all carriers
+    part: float  # share of all carriers
     carriers: int
     depth: int
     codewords: Codewords
@@ -69,7 +69,7 @@ class Allocation:
     """The division of carriers between payloads."""
 
     depth: int
-    shares: list[Share]  # of each payload
+    shares: list[Share]  # one per payload
     independent: bool  # True if no share depends on other secrets
 
 

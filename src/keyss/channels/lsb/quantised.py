@@ -44,7 +44,7 @@ from keyss.keys.derivation import DerivedKey, expand, fill, stream
 
 LEAST_BYTES = 48  # minimum bytes of a block, which give the salt
 MIN_BLOCKS = 3  # a salt, parameters, and data
-_ATTEMPTS = 30  # to solve all blocks; each fails for at most one cover in a thousand
+_ATTEMPTS = 30  # attempts to solve all blocks; one fails for at most one cover in a thousand
 _BITS_PER_GAUSSIAN = 18  # approximate capacity
 
 
@@ -81,7 +81,7 @@ class QuantisedCover:
     fields: list[Field]
     free: list[Flags]  # [N] per field: levels that may be written
     model_hash: bytes
-    decoded: Decoded | None = None  # in the same order; its model is published instead of the file
+    decoded: Decoded | None = None  # in the order of `codes`; its model is published instead of the file
 
     @staticmethod
     def of(codes: Codes, decoded: Decoded | None = None) -> QuantisedCover:

@@ -30,11 +30,11 @@ from keyss.core.arrays import Bytes, Flags, Integers
 from keyss.kernels.parallel import in_blocks
 from keyss.keys.derivation import expand
 
-_CANDIDATES = 8  # Gaussians that are looked at for each place
+_CANDIDATES = 8  # Gaussians considered for each place
 _NUMBER_BYTES = 2
-_LEAST_TAGGED = 5  # bytes of a row from which on it has a tag
+_LEAST_TAGGED = 5  # minimum bytes of a row with a tag
 _PER_GROUP = 32  # codewords of a group whose rows have tags; groups of 2^15 shards hardly differ in size
-_ROWS = 1 << 13  # at a time: what is made of them stays in the cache
+_ROWS = 1 << 13  # rows per batch, whose temporaries fit in the cache
 _BLOCK = 16
 
 

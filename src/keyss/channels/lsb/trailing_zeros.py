@@ -22,11 +22,12 @@ import numpy as np
 
 from keyss.core.arrays import Doubles, Integers, Words32
 
-_MAX_ZEROS = 12  # counted at most; numbers with more are rare, or short
+_MAX_ZEROS = 12  # maximum count; numbers with more zeros are rare, or short
 _EXPONENTS = 256
 _NUMBERS = np.arange(1 << _MAX_ZEROS, dtype=np.uint32)[:, None] | np.uint32(1 << _MAX_ZEROS)
 _ZEROS = (_NUMBERS >> np.arange(_MAX_ZEROS + 1, dtype=np.uint32) & 1).argmax(axis=1).astype(np.uint32)
-_UNIFORM = 0.5 ** np.append(np.arange(1, _MAX_ZEROS), _MAX_ZEROS - 1)  # of 1 to 12 zeros of even numbers
+# Probabilities of 1 to 12 trailing zeros in random even numbers.
+_UNIFORM = 0.5 ** np.append(np.arange(1, _MAX_ZEROS), _MAX_ZEROS - 1)
 # Drop of the log-likelihood at the confidence limit: one-sided, one in 200.
 _DROP = 3.3
 _MARGIN, _STEP = 8, 0.25  # range beyond the numbers' exponents and resolution of the search for s; octaves

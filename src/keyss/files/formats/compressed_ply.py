@@ -39,7 +39,7 @@ _BOUNDS = [
     for end in ("min", "max")
     for name in names.split()
 ]
-_COLOR_BOUNDS = np.repeat(np.array([0, 1], np.float32), 3)  # of old files, which do not state them
+_COLOR_BOUNDS = np.repeat(np.array([0, 1], np.float32), 3)  # defaults of files without colour bounds
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 

@@ -13,7 +13,7 @@ from keyss.fitting.config import FitConfig
 from keyss.methods.codec.precision import finest_size, prune_to_size, usual_size
 from keyss.rendering.orbit import Viewpoints
 
-_BITS_PER_GAUSSIAN = 150, 210  # of a secret that is not fitted yet, with the usual and the finest precision
+_BITS_PER_GAUSSIAN = 150, 210  # usual and finest precision of a secret that is not fitted yet
 _SAMPLE, _FAR_TOO_LARGE = 10_000, 1.5  # Gaussians; times what can be appended
 _TINY = 16  # Gaussians; secrets are not pruned to fewer
 

@@ -36,7 +36,7 @@ from keyss.rendering.orbit import Viewpoints
 # Fine-tuning to renders starts near the optimum: maximum steps, and factor on the rates.
 _MODEL_ITERATIONS, _MODEL_RATE = 400, 0.1
 _SELECTION_VIEWS = 64
-_FINE_TUNED_SHARE = 0.97  # of the Gaussians that fit are kept, since fine-tuned ones compress a little worse
+_FINE_TUNED_SHARE = 0.97  # Gaussians fine-tuned / Gaussians that fit: fine-tuning costs compression
 # Least shares of a secret's Gaussians. Public models fine-tuned with fewer are below 30 dB; with fewer than
 # the second, and than so many Gaussians, below 20 dB or as far from the plain model as empty renders.
 _MIN_SHARE, _HOPELESS_SHARE, _HOPELESS = 1 / 6, 1 / 100, 500

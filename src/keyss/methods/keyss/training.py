@@ -207,7 +207,7 @@ class KeyssTraining(TrainingRun):
         degree, ssim_weight = self.fit.sh_degree_at(self.iteration), self.fit.ssim_weight
         total = torch.zeros((), device=self.device)
         drawn: dict[int, Picture] = {}
-        weights: dict[int, float] = {}  # by render: baselines render scenes together
+        weights: dict[int, float] = {}  # one per render: baselines render scenes together
         for pose in dict.fromkeys(poses):
             scenes = [scene for scene, scene_pose in enumerate(poses) if scene_pose == pose]
             pictures = self.draw(scenes, self.poses.camera(*pose), degree)
