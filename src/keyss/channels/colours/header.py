@@ -110,11 +110,11 @@ class Header:
 
 
 def _read(
-    secrets: Secrets, carriers: Carriers, found: Sequence[tuple[Integers, Flags]], depth: int
+    secrets: Secrets, carriers: Carriers, chosen: Sequence[tuple[Integers, Flags]], depth: int
 ) -> Header | None:
-    """The header with `depth` bits per value of the places `found`."""
+    """The header with `depth` bits per value; `chosen`: see `places`, for each salt."""
     words, hints, owners, odds = [np.zeros(0, np.uint64)], [np.zeros(0)], [np.zeros(0, np.int64)], []
-    for salt, (secret, (rows, pilots)) in enumerate(zip(secrets.salted, found, strict=True)):
+    for salt, (secret, (rows, pilots)) in enumerate(zip(secrets.salted, chosen, strict=True)):
         ids, counts = carriers.ids[rows], np.full(len(rows), depth)
         known = np.repeat(pilots, COLUMNS * depth)
         every = np.repeat(_HELD * carriers.certainty[rows], COLUMNS * depth) * read(

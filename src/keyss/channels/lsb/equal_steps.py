@@ -81,8 +81,8 @@ class Steps:
         moved = np.zeros(len(self.order), bool)
 
         def mark(start: int, stop: int) -> None:
-            own = rows[start:stop]
-            _mark(own, self.others[own], *self.words, depth, moved)
+            block = rows[start:stop]
+            _mark(block, self.others[block], *self.words, depth, moved)
 
         in_blocks(mark, len(rows), _ROWS, _mark)
         _mark(distant[0], distant[1, :, None].astype(np.int32), *self.words, depth, moved)
@@ -98,13 +98,13 @@ class Steps:
 
         rows, random, chances = self.order[usable[self.order]], np.random.default_rng(0), [1.0]
         rows = rows[:: max(1, len(rows) // _SAMPLE)]
-        found, count = np.empty((0, 7), np.uint32), 0
-        while count == len(found):
-            found = np.empty((2 * len(found) + len(rows) + 1, 7), np.uint32)
-            count = _list(rows, self.others[rows][:, 1:], *self.words, depth, found)
+        entries, count = np.empty((0, 7), np.uint32), 0
+        while count == len(entries):
+            entries = np.empty((2 * len(entries) + len(rows) + 1, 7), np.uint32)
+            count = _list(rows, self.others[rows][:, 1:], *self.words, depth, entries)
         for kind in _KINDS:
-            own = found[:count][found[:count, 6] == kind]
-            words, written = own[:, :4], usable[np.tile(own[:, 4:6], 2)]
+            listed = entries[:count][entries[:count, 6] == kind]
+            words, written = listed[:, :4], usable[np.tile(listed[:, 4:6], 2)]
             hits, drawn = _hits(words, depth), np.zeros(len(_PARTS))
             for _ in range(_DRAWS):
                 drawn += _hits(redrawn(words, written, depth, random), depth)
@@ -160,9 +160,9 @@ def _distant_siblings(sh: Words32) -> Integers:
         order, pairs = keys & 0xFFFFFFFF, []
         sums, cells = sums[order], cells[order]
         for other in others:
-            found = np.empty((_PARTNERS * len(order), 2), np.int64)
-            count = _sweep(sums, np.pad(other[order], (0, _BLOCK)), cells, found)
-            pairs.append(order[found[:count].T])
+            partners = np.empty((_PARTNERS * len(order), 2), np.int64)
+            count = _sweep(sums, np.pad(other[order], (0, _BLOCK)), cells, partners)
+            pairs.append(order[partners[:count].T])
         return np.concatenate(pairs, axis=1)
 
     colours = in_blocks(search, 6 if sh.shape[1] > 3 else 0, 1, _sweep)
@@ -179,7 +179,7 @@ def _hits(words: Words32, depth: int) -> Integers:
 
 
 @kernel
-def _sweep(first: Any, second: Any, cells: Any, found: Any) -> int:
+def _sweep(first: Any, second: Any, cells: Any, pairs: Any) -> int:
     """List pairs of points (first, second), by ascending `first`, that agree within `cells` [N]; how many.
 
     `second` [N + _BLOCK]: padded.
@@ -197,7 +197,7 @@ def _sweep(first: Any, second: Any, cells: Any, found: Any) -> int:
                 if count == most or first[other] - first[one] >= cells[one]:
                     break
                 if abs(second[other] - second[one]) < cells[one]:
-                    found[count, 0], found[count, 1] = one, other
+                    pairs[count, 0], pairs[count, 1] = one, other
                     count += 1
     return count
 
@@ -206,11 +206,11 @@ def _sweep(first: Any, second: Any, cells: Any, found: Any) -> int:
 def _drop_mutual(rows: Any, others: Any) -> None:
     """Keep each pair of mutual neighbours once, in the first row: the other one gets _NOTHING."""
     for one in rows:
-        for each in range(2, others.shape[1]):
-            other = others[one, each]
+        for column in range(2, others.shape[1]):
+            other = others[one, column]
             for its in range(2, others.shape[1] if other < one else 0):
                 if others[other, its] == one:
-                    others[one, each] = _NOTHING
+                    others[one, column] = _NOTHING
 
 
 @inline
@@ -315,10 +315,10 @@ def _mark(rows: Any, others: Any, geometry: Any, sh: Any, depth: int, moved: Any
 
 
 @kernel
-def _list(rows: Any, others: Any, geometry: Any, sh: Any, depth: int, found: Any) -> int:
+def _list(rows: Any, others: Any, geometry: Any, sh: Any, depth: int, entries: Any) -> int:
     """List two numbers that differ by equal steps in `rows` [R] and `others` [R, K]; how many.
 
-    `found` [M, 7]: first number of both Gaussians, second number, the Gaussians (one for _COLOURS), kind.
+    `entries` [M, 7]: first number of both Gaussians, second number, the Gaussians (one for _COLOURS), kind.
     Lists at most M. Steps of up to two cells are small by chance.
     """
     quats, size, count = geometry.shape[1] // 4, _FIRST + _LANES, 0
@@ -332,12 +332,12 @@ def _list(rows: Any, others: Any, geometry: Any, sh: Any, depth: int, found: Any
             _compare(x, y, depth, known, steps, cells)
             for at in range(size):
                 first, groups = (0, quats) if at < _FIRST else (_FIRST, 3)
-                for each in range(first + (at - first) % groups, at, groups):
-                    if _agree(steps, cells, at, each) and steps[at] > 2 * max(cells[at], cells[each]):
-                        if count == len(found):
+                for second in range(first + (at - first) % groups, at, groups):
+                    if _agree(steps, cells, at, second) and steps[at] > 2 * max(cells[at], cells[second]):
+                        if count == len(entries):
                             return count
-                        entry = found[count]
-                        entry[0], entry[1], entry[2], entry[3] = x[at], y[at], x[each], y[each]
+                        entry = entries[count]
+                        entry[0], entry[1], entry[2], entry[3] = x[at], y[at], x[second], y[second]
                         entry[4], entry[5], entry[6] = one, max(one, other), _GEOMETRY
                         if at >= _FIRST:
                             entry[6] = _HARMONICS if other >= 0 else _BETWEEN_COLOURS

@@ -37,7 +37,8 @@ def salt_rows(gaussians: Gaussians, ids: Bytes, layout: Layout) -> Integers:
     best = np.argpartition(keys, SALTS - 1)[:SALTS] if len(keys) > SALTS else np.arange(len(keys))
     low = read_low_bits(gaussians[torch.from_numpy(rows[best])], LEAST, layout)
     places = [
-        (ranks[each], ids[rows[each]].tobytes(), own.tobytes()) for each, own in zip(best, low, strict=True)
+        (ranks[index], ids[rows[index]].tobytes(), bits.tobytes())
+        for index, bits in zip(best, low, strict=True)
     ]
     return rows[best[sorted(range(len(best)), key=places.__getitem__)]]
 

@@ -41,15 +41,15 @@ _BLOCK = 16
 def function(secret: bytes, label: str, ids: Bytes, size: int = _BLOCK) -> Bytes:
     """[N, size] a pseudo-random function of `ids` [N, 16]; bytes 16 i to 16 i + 15 are AES of (ID xor i)."""
     key, blocks = expand(secret, f"lsb/{label}", 32), -(-size // _BLOCK)
-    found = np.empty((len(ids), size), np.uint8)
+    output = np.empty((len(ids), size), np.uint8)
 
     def work(start: int, stop: int) -> None:
         counted = np.repeat(ids[start:stop, None], blocks, axis=1)
         counted[:, :, -1] ^= np.arange(blocks, dtype=np.uint8)
-        found[start:stop] = encrypted_blocks(key, counted).reshape(stop - start, -1)[:, :size]
+        output[start:stop] = encrypted_blocks(key, counted).reshape(stop - start, -1)[:, :size]
 
     in_blocks(work, len(ids), _ROWS)
-    return found
+    return output
 
 
 def parameter_pads(data_key: bytes, ids: Bytes) -> Bytes:

@@ -231,16 +231,16 @@ def _without_small_even(gaussians: Gaussians, layout: Layout, counted: Flags) ->
     groups, fine = layout.groups(gaussians), np.ones(len(gaussians), bool)
 
     def count(start: int, stop: int) -> Integers:
-        own = counted[start:stop]
-        return np.stack([count_trailing_zeros(words[start:stop][own]) for words in groups.values()])
+        mask = counted[start:stop]
+        return np.stack([count_trailing_zeros(words[start:stop][mask]) for words in groups.values()])
 
     counts = np.sum(in_blocks(count, len(fine), BLOCK), axis=0)
-    least = [least_exponent(each, MAX_SEPARATION / len(ATTRIBUTES)) for each in counts]
+    least = [least_exponent(histogram, MAX_SEPARATION / len(ATTRIBUTES)) for histogram in counts]
 
     def compare(start: int, stop: int) -> None:
         for words, bound in zip(groups.values(), least, strict=True):
-            own = words[start:stop]
-            fine[start:stop] &= ~((exponents(own) < bound) & (own & 1 == 0)).any(axis=1)
+            block = words[start:stop]
+            fine[start:stop] &= ~((exponents(block) < bound) & (block & 1 == 0)).any(axis=1)
 
     in_blocks(compare, len(fine), BLOCK)
     return fine

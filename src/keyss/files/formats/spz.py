@@ -147,8 +147,8 @@ def _unpack_gzip(data: bytes) -> tuple[_Header, bytes, bytes]:
     except zlib.error as error:
         raise InputError(f"damaged SPZ: {reason(error)}") from error
     if len(body) < size or not stream.eof:
-        found = "fewer" if len(body) < size or not stream.unconsumed_tail else "more"
-        raise not_whole("SPZ", f"expected {size:,} bytes of {header.gaussians:,} Gaussians, found {found}")
+        amount = "fewer" if len(body) < size or not stream.unconsumed_tail else "more"
+        raise not_whole("SPZ", f"expected {size:,} bytes of {header.gaussians:,} Gaussians, found {amount}")
     return header, body[:size], body[size:] if header.flags & EXTENSIONS else b""
 
 
