@@ -48,7 +48,7 @@ class Capacity:
 
     @property
     def bytes(self) -> int:
-        """Of one payload."""
+        """Maximum bytes of one payload."""
         return self.shares[-1][1]
 
     def limits(self, needed: Sequence[int]) -> list[int]:
@@ -79,7 +79,7 @@ class PreparedCover(Protocol):
 
     @property
     def capacity(self) -> Capacity:
-        """Its capacity."""
+        """The capacity of the cover."""
 
     def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
         """Embed one (key, payload) per secret.

@@ -230,12 +230,12 @@ class Prepared:
     """A hiding that a method has checked, with everything that is decided before training."""
 
     options: Any  # as given; the method may complete `fit`
-    fits: tuple[FitConfig, ...]  # of the plain models, the cover first
-    training: tuple[Training, ...]  # the method's own, of each scene
+    fits: tuple[FitConfig, ...]  # fits of the plain models, the cover first
+    training: tuple[Training, ...]  # the method's training of each scene, the cover first
     plan: Plan
     grows: bool = False  # the file grows with the secrets
     survives: bool = False  # the secrets survive conversion to other formats
-    capacity: Any = None  # the method's own view of the cover and what it holds, as large as the model
+    capacity: Any = None  # private to the method: the prepared cover, as large as the model
 
     @staticmethod
     def of(options: MethodOptions, scenes: int, plan: Plan) -> Prepared:

@@ -28,7 +28,7 @@ from keyss.files.formats.common import morton_order
 from keyss.kernels.jit import inline, kernel
 from keyss.kernels.parallel import in_blocks
 
-_NEIGHBOURS = 8  # most siblings; detectors that look at 12 find no more than with 12 here
+_NEIGHBOURS = 8  # searched for siblings; with 12, detectors that look at 12 find as little
 _EQUAL = 3  # equal steps that exclude a Gaussian
 _PARTNERS, _WINDOW = 2, 1 << 8  # distant siblings per Gaussian, and candidates for them
 _ROWS = 1 << 11  # rows per batch of a thread
@@ -180,7 +180,7 @@ def _hits(words: Words32, depth: int) -> Integers:
 
 @kernel
 def _sweep(first: Any, second: Any, cells: Any, pairs: Any) -> int:
-    """List pairs of points (first, second), by ascending `first`, that agree within `cells` [N]; how many.
+    """List pairs of points (first, second), by ascending `first`, that agree within `cells` [N]; return how many.
 
     `second` [N + _BLOCK]: padded.
     """
@@ -316,7 +316,7 @@ def _mark(rows: Any, others: Any, geometry: Any, sh: Any, depth: int, moved: Any
 
 @kernel
 def _list(rows: Any, others: Any, geometry: Any, sh: Any, depth: int, entries: Any) -> int:
-    """List two numbers that differ by equal steps in `rows` [R] and `others` [R, K]; how many.
+    """List two numbers that differ by equal steps in `rows` [R] and `others` [R, K]; return how many.
 
     `entries` [M, 7]: first number of both Gaussians, second number, the Gaussians (one for _COLOURS), kind.
     Lists at most M. Steps of up to two cells are small by chance.

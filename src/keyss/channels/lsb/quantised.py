@@ -199,7 +199,7 @@ class QuantisedCover:
         return codes
 
     def _model_to_publish(self, codes: Codes, entropy: bytes) -> Gaussians:
-        """The model of `codes` in the order of the format or, if the cover has an own one, of the cover."""
+        """The model of `codes` in the order of the format or, if the cover has its own, of the cover."""
         within = random_fractions(entropy, "codes/file-order", 3 * len(codes)).reshape(-1, 3) - 0.5
         order = file_order(codes, within)
         if self.decoded is None:
@@ -245,7 +245,7 @@ class QuantisedReader(SaltedReader):
 
 
 def _capacity(total: int, width: int) -> Capacity:
-    """Of `total` bytes in blocks of `width`: one holds parameters, and the last may not be full."""
+    """The capacity of `total` bytes in blocks of `width`: one holds parameters; the last may not be full."""
     shares = [(1 / part, total // part) for part in (4, 2, 1)]
     return Capacity.of_sealed(2 * width + container.MAX_OVERHEAD, shares, lambda count: total // count)
 

@@ -42,7 +42,7 @@ def count_trailing_zeros(words: Words32) -> Integers:
 
 
 def least_exponent(counts: Integers, share: float) -> int:
-    """The least exponent e such that even numbers of exponents from e on give away at most `share`.
+    """The least exponent e such that even numbers of exponents from e on leak at most `share`.
 
     `counts`: the result of `count_trailing_zeros`. `share`: maximum squared separation (d') of the plain file
     and the file with new bits.
@@ -56,7 +56,7 @@ def least_exponent(counts: Integers, share: float) -> int:
     likelihoods = (even * np.log(chances)).sum(axis=(1, 2))
     likely = np.flatnonzero(likelihoods >= likelihoods.max() - _DROP)
     chosen = likely[-1]
-    if likely[0] == 0:  # nothing excludes that no zeros are forced; too few numbers may exclude nothing
+    if likely[0] == 0:  # perhaps no zeros are forced, or there are too few numbers to tell
         numbers = counts[present].sum(axis=1).cumsum()
         most = present[np.searchsorted(numbers, numbers[-1] / 2)] - _LARGEST
         chosen = min(chosen, max(0, np.searchsorted(scales, most)))

@@ -6,8 +6,8 @@ derived from the cover, which only the writer has.
 
 Coincidences are more frequent than by chance. Trainers start with round Gaussians, some with rotations by 0
 degrees, and where few views show them they stay nearly so. Clones start with equal rotations and scales.
-Writing would spread all of these. Of each kind of coincidence a random part stays, the excess over chance:
-writing makes as many of the others as it spreads.
+Writing would destroy these coincidences, so a random subset of each kind stays untouched, as large as the
+excess over chance.
 """
 
 from __future__ import annotations

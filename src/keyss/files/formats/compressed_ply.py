@@ -96,7 +96,7 @@ class CompressedPlyCodes(Codes):
         packed[:, 1] = self.largest.astype(np.uint32) << 30 | _pack_fields(self.rotations, (10, 10, 10))
         packed[:, 2] = _pack_fields(self.scales, VECTOR)
         packed[:, 3] = _pack_fields(self.colors, (8, 8, 8)) << np.uint32(8) | self.alphas
-        has_colors = bool((self.bounds[:, 12:] != _COLOR_BOUNDS).any())  # not in old files
+        has_colors = bool((self.bounds[:, 12:] != _COLOR_BOUNDS).any())  # optional
         names = _BOUNDS if has_colors else _BOUNDS[:12]
         elements = {
             "chunk": (len(self.bounds), [f"float {name}" for name in names]),

@@ -14,7 +14,7 @@ from keyss.methods.codec.precision import finest_size, prune_to_size, usual_size
 from keyss.rendering.orbit import Viewpoints
 
 _BITS_PER_GAUSSIAN = 150, 210  # usual and finest precision of a secret that is not fitted yet
-_SAMPLE, _FAR_TOO_LARGE = 10_000, 1.5  # Gaussians; times what can be appended
+_SAMPLE, _FAR_TOO_LARGE = 10_000, 1.5  # Gaussians of a sample; size / what can be appended
 _TINY = 16  # Gaussians; secrets are not pruned to fewer
 
 

@@ -42,7 +42,7 @@ from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_te
 NAME = "keyss"
 FORMAT, VERSION = "keyss-secret", 1
 ANCHORS = 64
-ANCHORS_NEEDED = 0.25  # minimum share found
+ANCHORS_NEEDED = 0.25  # minimum share of the anchors that are Gaussians of the model
 ANCHOR_TOLERANCE = 1e-6  # fraction of the model's size
 _SLACK = 0.01  # share of the Gaussians that rounding may make visible or invisible
 _WEIGHTS = "decoder."
