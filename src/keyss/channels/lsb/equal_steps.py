@@ -180,9 +180,9 @@ def _hits(words: Words32, depth: int) -> Integers:
 
 @kernel
 def _sweep(first: Any, second: Any, cells: Any, pairs: Any) -> int:
-    """List pairs of points (first, second), by ascending `first`, that agree within `cells` [N]; return how many.
+    """List pairs of points (first, second) that agree within `cells` [N]; return their number.
 
-    `second` [N + _BLOCK]: padded.
+    `first` is ascending; `second` [N + _BLOCK] is padded.
     """
     count = 0
     for one in range(len(first)):
