@@ -58,7 +58,7 @@ _BLOOM_BYTES = 128
 # Least share of foreign Gaussians that causes a warning. Conversions make none foreign; of another model,
 # 0.95 and more are.
 _LEAST_SHARE = 0.05
-# Numbers of faint Gaussians, of those out of range and of all others than faint; area; Bloom filter.
+# Numbers of faint, of out-of-range and of visible Gaussians; area; Bloom filter.
 _COARSE = struct.Struct(f"<IIIf{_BLOOM_BYTES}s")
 COARSE_BYTES = _COARSE.size
 

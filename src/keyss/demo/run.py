@@ -88,7 +88,7 @@ def run_demo(
             viewer = page_with((out / STEGO).read_bytes(), Path(STEGO).name, look)
             files = {SECRET_PLY: revealed, COMPARISON: comparison, KEY: f"{key}\n".encode()}
             results.write(files | {VIEWER: viewer})
-        for name in (VIEWER, WEB):  # what a page needs; they hold published models
+        for name in (VIEWER, WEB):  # pages contain published models
             (out / name).chmod(public_mode())
         return DemoResult(metrics, refused)
     except BaseException as error:

@@ -77,7 +77,7 @@ class HideMetrics(HidingQuality):
     gaussians: int  # Gaussians of the stego model
     photos: tuple[bool, ...]  # cover, then secrets; False: test views are renders of a given model
     secret_gaussians: tuple[int, ...]  # Gaussians of each revealed secret
-    secret_degrees: tuple[tuple[int, int], ...]  # SH degree of each, and of its plain model
+    secret_degrees: tuple[tuple[int, int], ...]  # SH degrees of each secret and of its plain model
     iterations: int  # joint training steps; 0 if the method does not train
     # Total training steps of the cover and of each secret; None: unknown, the plain model was given.
     steps: tuple[int | None, ...]

@@ -28,7 +28,7 @@ export interface SpzCodes extends Header {
   readonly colours: Uint8Array; // [N, 3]
   readonly scales: Uint8Array; // [N, 3] 16ths of log scales
   readonly largest: Uint8Array; // [N] index (xyzw) of the component left out
-  readonly rotations: Uint16Array; // [N, 3] the others: 512 (if negative) + magnitude; version 2: 8 bits
+  readonly rotations: Uint16Array; // [N, 3] components that are stored: 512 (if negative) + magnitude; version 2: 8 bits
   readonly harmonics: Uint8Array; // [N, K - 1, 3]
 }
 

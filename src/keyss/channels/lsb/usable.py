@@ -75,7 +75,7 @@ class Carriers:
 
     ids: Bytes  # [N, 16] of all Gaussians
     usable: Flags  # [N] mask of those in which new low bits do not show
-    depth: int  # maximum depth at which they do not show
+    depth: int  # maximum depth at which new low bits do not show
     renewable: Flags  # [N] mask of those that may be written at the least depth, as salts are
 
     @staticmethod

@@ -52,7 +52,7 @@ class CompressedPlyCodes(Codes):
     bounds: Floats  # [C, 18] min, then max of x y z; log scales; r g b (f_dc * SH_C0 + 0.5)
     positions: Shorts  # [N, 3] 11, 10 and 11 bits, between the bounds
     largest: Bytes  # [N] index of the component of wxyz left out
-    rotations: Shorts  # [N, 3] 10 bits each, the other components from -sqrt(1/2) to sqrt(1/2)
+    rotations: Shorts  # [N, 3] components that are stored, 10 bits each, from -sqrt(1/2) to sqrt(1/2)
     scales: Shorts  # [N, 3] 11, 10 and 11 bits, between the bounds
     colors: Bytes  # [N, 3] between the bounds
     alphas: Bytes  # [N] opacities in 255ths

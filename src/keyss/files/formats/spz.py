@@ -201,7 +201,7 @@ class SpzCodes(Codes):
     colors: Bytes  # [N, 3] f_dc in steps of 1/38.25; 127.5 is 0
     scales: Bytes  # [N, 3] log scales in 16ths from -10 on
     largest: Bytes  # [N] index of the component of xyzw left out; always 3 in version 2
-    # [N, 3] the other components: 512 (if negative) + magnitude in 511ths of sqrt(1/2); version 2: 8 bits
+    # [N, 3] stored components: 512 (if negative) + magnitude in 511ths of sqrt(1/2); version 2: 8 bits
     rotations: Shorts
     sh: Bytes  # [N, K - 1, 3] harmonics in 128ths from -1 on
     extensions: bytes = b""  # not parsed
