@@ -134,7 +134,7 @@ class RunFolder:
             )
 
     def _has_files(self) -> bool:
-        """True if the folder has a file; a killed process may leave folders, locks and a half-written manifest."""
+        """True if the folder has a file; a killed process may leave folders, locks and a partial manifest."""
         manifest = self.path / MANIFEST
         left = {self.path / _LOCK, *(manifest.with_name(f".{manifest.name}.{end}") for end in LEFTOVERS)}
         paths = self.path.rglob("*")
