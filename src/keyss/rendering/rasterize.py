@@ -24,22 +24,22 @@ FOCAL_LENGTH_MIN = 1e-6  # pixels
 _FAR_PLANE = 1e10  # gsplat's default
 
 
-def render(
-    gaussians: Gaussians, camera: Camera, background: Tensor | None = None, *, sh_degree: int | None = None
-) -> Tensor:
+def render(gaussians: Gaussians, camera: Camera, background: Tensor | None = None) -> Tensor:
     """Render an image [H, W, 3]: 0 is black, 1 is white, not clamped above.
 
-    `background` [3]: black if None; a model that a network decodes has its own. `sh_degree`: maximum degree
-    of the spherical harmonics, by default all. Renders on the device of the Gaussians; differentiable. Raises
-    the errors of `rasterization`.
+    `background` [3]: black if None; a model that a network decodes has its own. Renders on the device of the
+    Gaussians; differentiable. Raises the errors of `rasterization`.
     """
-    return render_with_meta(gaussians, camera, background, sh_degree=sh_degree)[0]
+    return render_with_meta(gaussians, camera, background)[0]
 
 
 def render_with_meta(
     gaussians: Gaussians, camera: Camera, background: Tensor | None = None, *, sh_degree: int | None = None
 ) -> tuple[Tensor, dict[str, Any]]:
-    """`render`, and the meta of `rasterization` with the `alpha` [H, W]."""
+    """`render`, and the meta of `rasterization` with the `alpha` [H, W].
+
+    `sh_degree`: maximum degree of the spherical harmonics, by default all.
+    """
     if sh_degree is None:
         sh_degree = gaussians.sh_degree
     if not isinstance(gaussians, DecodedGaussians):
