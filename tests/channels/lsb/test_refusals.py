@@ -13,7 +13,7 @@ from keyss.channels import channel_for
 from keyss.channels.appended import appended_channel
 from keyss.channels.lsb import usable
 from keyss.core import Gaussians, UsageError
-from keyss.methods.carry import carry_method
+from keyss.methods.carry import capacity
 
 
 def test_large_covers_without_random_bits_are_refused_by_a_sample(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -59,9 +59,9 @@ def test_secrets_that_cannot_be_appended_are_refused_by_a_sample(monkeypatch: py
         sizes.append(len(model))
         return original(model)
 
-    original = carry_method.usual_size
-    monkeypatch.setattr(carry_method, "usual_size", counted)
-    monkeypatch.setattr(carry_method, "_SAMPLE", 1000)
+    original = capacity.usual_size
+    monkeypatch.setattr(capacity, "usual_size", counted)
+    monkeypatch.setattr(capacity, "_SAMPLE", 1000)
     secret = trained_like(20_000, 1)
     exact = original(secret)
     with monkeypatch.context() as smaller:
@@ -72,4 +72,4 @@ def test_secrets_that_cannot_be_appended_are_refused_by_a_sample(monkeypatch: py
     (told,) = re.findall(r"about ([0-9,]+) bytes", str(refused.value))
     assert 0.8 * exact < int(told.replace(",", "")) < 1.2 * exact
     monkeypatch.setattr(appended_channel, "MAX_BYTES", exact)
-    carry_method.check_appended(secret)  # may fit
+    capacity.check_appended(secret)  # may fit

@@ -15,7 +15,7 @@ from keyss.channels import LOW_BITS, Layout, LowBitsCapacity, Payload, sealed_si
 from keyss.channels.foreign import EXACT_BYTES
 from keyss.core import KeyssWarning, UsageError
 from keyss.methods import Context, Prepared, Source, registry
-from keyss.methods.carry.carry_method import CarryCapacity
+from keyss.methods.carry.capacity import CarryCapacity
 from keyss.rendering import Viewpoints, scene_of_model
 
 KEY = "a key of many characters: 93hXmQ2"

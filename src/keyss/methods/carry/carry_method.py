@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-import math
+import hashlib
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
-from keyss.channels import APPENDED, Capacity, Channel, Payload, PreparedCover, open_payload
-from keyss.core.errors import UsageError
+from keyss.channels import Channel, Payload, PreparedCover, open_payload
+from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.schedule import boost_of
-from keyss.methods.carry.carried_secret import CarriedSecret
+from keyss.methods.carry.capacity import CarryCapacity, SecretSize, check_appended
 from keyss.methods.carry.carry_options import FINE_TUNING, CarryOptions
-from keyss.methods.codec.precision import encode_to_size, finest_size, prune_to_size, usual_size
+from keyss.methods.codec.model_bytes import decode
+from keyss.methods.codec.precision import encode_to_size, finest_size
+from keyss.methods.hidden import Frame, HiddenScene, Recovered
 from keyss.methods.method import (
     Capabilities,
     Context,
@@ -41,98 +44,46 @@ _FINE_TUNED_SHARE = 0.97  # Gaussians fine-tuned / Gaussians that fit: fine-tuni
 # Least shares of a secret's Gaussians. Public models fine-tuned with fewer are below 30 dB; with fewer than
 # the second, and than so many Gaussians, below 20 dB or as far from the plain model as empty renders.
 _MIN_SHARE, _HOPELESS_SHARE, _HOPELESS = 1 / 6, 1 / 100, 500
-_BITS_PER_GAUSSIAN = 150, 210  # usual and finest precision of a secret that is not fitted yet
-_SAMPLE, _FAR_TOO_LARGE = 10_000, 1.5  # Gaussians of a sample; size / what can be appended
-_TINY = 16  # Gaussians; secrets are not pruned to fewer
 
 
 @dataclass(frozen=True)
-class SecretSize:
-    """The size of a secret, at most if it is not fitted yet."""
+class CarriedSecret(HiddenScene):
+    """A carried secret."""
 
-    count: int  # Gaussians
-    usual: int  # bytes of its payload with the usual precision
-    finest: int
-    sh_degree: int
-    fitted: bool
+    payload: Payload
+    frame = None
 
     @staticmethod
-    def of(model: Gaussians | None, fit: FitConfig) -> SecretSize:
-        """The size of `model`, or of what `fit` will give."""
-        if model is not None:
-            return SecretSize(len(model), usual_size(model), finest_size(model), model.sh_degree, True)
-        usual, finest = (fit.max_gaussians * bits // 8 for bits in _BITS_PER_GAUSSIAN)
-        return SecretSize(fit.max_gaussians, usual, finest, fit.sh_degree, False)
+    def of(payload: Payload) -> CarriedSecret:
+        """Read a payload. Raises InputError for damage."""
+        secret = CarriedSecret(payload)
+        _ = secret.gaussians
+        return secret
 
+    @cached_property
+    def gaussians(self) -> Gaussians:
+        """Decoded when it is first needed: until then, a secret takes a fifth of the memory."""
+        return decode(self.payload.data, self.payload.model_size)
 
-def check_appended(model: Gaussians) -> None:
-    """Raise UsageError for a secret far too large for appended Gaussians, by a sample of it.
-
-    A sparse sample takes more bits for positions: log2 of the distance between its Gaussians.
-    """
-    step, most = len(model) // _SAMPLE, APPENDED.estimate_capacity(0, 0).bytes
-    if step < 2:
-        return
-    sample = model[::step]
-    size = len(model) * (usual_size(sample) / len(sample) - math.log2(step) / 8)
-    if size > _FAR_TOO_LARGE * most:
-        raise UsageError(
-            f"the secret takes about {size:,.0f} bytes, and {most:,} can be "
-            "appended; fewer Gaussians or a lower SH degree take less"
-        )
-
-
-@dataclass(frozen=True)
-class CarryCapacity:
-    """The capacity of a cover: exact for a prepared cover, estimated for one not fitted yet."""
-
-    gaussians: int  # Gaussians of the cover
-    sh_degree: int  # SH degree of the published model
-    channel: Channel
-    payloads: Capacity
-    prepared: PreparedCover | None = None  # None: not fitted yet
-
-    @staticmethod
-    def of(channel: Channel, cover: Gaussians | None, fit: FitConfig) -> CarryCapacity:
-        """The capacity of `cover`, or of what `fit` will give. Raises UsageError if there is none."""
-        if cover is None:
-            size = fit.max_gaussians, fit.sh_degree
-            return CarryCapacity(*size, channel, channel.estimate_capacity(*size))
-        prepared = channel.prepare(cover)
-        return CarryCapacity(len(cover), cover.sh_degree, channel, prepared.capacity, prepared)
-
-    def sizes(self, secrets: Sequence[SecretSize]) -> list[int]:
-        """The number of Gaussians of each secret that fit at its SH degree; an estimate where not all do.
-
-        Raises UsageError if the cover is too small.
-        """
-        limits = self.payloads.limits([secret.finest for secret in secrets])
-        counts = [
-            min(secret.count, secret.count * limit // secret.usual)
-            for secret, limit in zip(secrets, limits, strict=True)
-        ]
-        if any(count < min(_TINY, secret.count) for count, secret in zip(counts, secrets, strict=True)):
-            raise UsageError(
-                f"a cover of {self.gaussians:,} Gaussians is too small to hide {len(secrets)} "
-                f"{'secrets' if len(secrets) > 1 else 'secret'} in its {self.channel.place}"
+    def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
+        """All Gaussians of the secret."""
+        if force:
+            warnings.warn(
+                "`force=True` has no effect: this secret opens whole or not at all",
+                KeyssWarning,
+                stacklevel=2,
             )
-        return counts
+        if frame == "cover":
+            raise UsageError(
+                'a carried secret has no position in the cover\'s coordinates: leave out `frame="cover"`'
+            )
+        return self.gaussians
 
-    def prune(self, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]) -> list[Gaussians]:
-        """The most visible Gaussians of each model that fit, or all; see `prune_to_size`.
+    def recovered(self, revealed: Gaussians) -> Recovered:
+        return Recovered(len(revealed), len(revealed), self.payload.shards)
 
-        Warns (KeyssWarning) if the models have less room than they would alone.
-        """
-        needed = list(map(finest_size, models))
-        self.payloads.warn_of_sharing(needed)
-        limits = self.payloads.limits(needed)
-        return [prune_to_size(*model) for model in zip(models, limits, viewpoints, strict=True)]
-
-    def appended(self, secrets: Sequence[SecretSize]) -> int:
-        """Approximate number of Gaussians by which the model grows."""
-        if not self.payloads.grows:
-            return 0
-        return APPENDED.appended_count([secret.usual for secret in secrets])
+    def fingerprint(self) -> str:
+        return hashlib.sha256(self.gaussians.means.numpy().tobytes()).hexdigest()[:16]
 
 
 class CarryMethod:
@@ -330,8 +281,8 @@ def embed_models(
         for limit, views in zip(capacity.limits(needed), viewpoints, strict=True)
     ]
     stego = cover.embed(list(zip(keys, payloads, strict=True)), entropy=entropy)
-    opened = list(map(CarriedSecret, map(partial(open_payload, stego), keys)))
-    if [secret.payload.data for secret in opened] != [payload.data for payload in payloads]:
+    read = list(map(partial(open_payload, stego), keys))
+    if [payload.data for payload in read] != [payload.data for payload in payloads]:
         raise RuntimeError("the embedded secrets do not open again as they should")
     sizes = [len(payload.data) for payload in payloads]
     details: dict[str, Any] = {
@@ -342,4 +293,4 @@ def embed_models(
     if not capacity.grows:
         details["capacity_bytes"] = capacity.bytes
         details["capacity_bits_per_gaussian"] = round(8 * capacity.bytes / len(cover.cover), 2)
-    return Stego(stego, tuple(opened), details=details, verified=True)
+    return Stego(stego, tuple(map(CarriedSecret, read)), details=details, verified=True)
