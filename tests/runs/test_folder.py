@@ -160,7 +160,8 @@ def test_killed_before_first_checkpoint(tmp_path: Path) -> None:
 @pytest.mark.parametrize("resume", [False, True])
 def test_killed_before_the_manifest(tmp_path: Path, resume: bool) -> None:
     (tmp_path / "private").mkdir()
-    (tmp_path / "private" / "lock").touch()
+    for name in ("lock", ".manifest.json.lock", ".manifest.json.unfinished"):
+        (tmp_path / "private" / name).touch()
     write_run(tmp_path, resume=resume)
     assert read_files(tmp_path)["publish/model.ply"] == b"1"
 

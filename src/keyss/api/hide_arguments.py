@@ -50,8 +50,8 @@ class HideResult:
     """The result of `hide`."""
 
     stego: Gaussians | None = None  # publish this; None after a dry run
-    metrics: HideMetrics | None = None  # of hidden scenes; None after a dry run
-    plan: Plan | None = None  # of hidden scenes; only after a dry run, like `cost`
+    metrics: HideMetrics | None = None  # quality of hidden scenes; None after a dry run
+    plan: Plan | None = None  # for hidden scenes, after a dry run, like `cost`
     cost: Cost | None = None
     survives: bool = False  # whether the secrets survive conversion to other formats
     psnr: float | None = None  # of hidden files: dB of the stego model's views to the cover's, at most 120

@@ -34,7 +34,7 @@ def first_shares(shares: Sequence[tuple[float, int]], sizes: Sequence[int]) -> l
 class Capacity:
     """The capacity of a cover, in bytes of data: exact for a prepared cover, an estimate for others."""
 
-    shares: tuple[tuple[float, int], ...]  # that a payload may get; see `first_shares`
+    shares: tuple[tuple[float, int], ...]  # possible shares of a payload; see `first_shares`
     equal: Callable[[int], int]  # bytes of each of several payloads with equal shares
     grows: bool = False  # True if the model grows with the hidden data, which should then be short
 
@@ -48,7 +48,7 @@ class Capacity:
 
     @property
     def bytes(self) -> int:
-        """Of one payload."""
+        """Maximum bytes of one payload."""
         return self.shares[-1][1]
 
     def limits(self, needed: Sequence[int]) -> list[int]:
@@ -79,7 +79,7 @@ class PreparedCover(Protocol):
 
     @property
     def capacity(self) -> Capacity:
-        """Its capacity."""
+        """The capacity of the cover."""
 
     def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
         """Embed one (key, payload) per secret.

@@ -58,7 +58,7 @@ _BLOOM_BYTES = 128
 # Least share of foreign Gaussians that causes a warning. Conversions make none foreign; of another model,
 # 0.95 and more are.
 _LEAST_SHARE = 0.05
-# Numbers of faint Gaussians, of those out of range and of all others than faint; area; Bloom filter.
+# Numbers of faint, of out-of-range and of visible Gaussians; area; Bloom filter.
 _COARSE = struct.Struct(f"<IIIf{_BLOOM_BYTES}s")
 COARSE_BYTES = _COARSE.size
 
@@ -66,7 +66,7 @@ COARSE_BYTES = _COARSE.size
 def copies(model: Gaussians) -> tuple[int, bool]:
     """The number of visible Gaussians with the position and the red of another; True if it is suspicious.
 
-    Two files of one cover, put into one, have many: no channel changes these numbers.
+    A file merged from two files of one cover has many: no channel changes these numbers.
     """
     visible = torch.cat([model.means, model.sh[:, 0, :1]], dim=1)[model.opacities > _COPIED]
     rows = visible.detach().cpu().numpy() + np.float32(0)  # no -0
@@ -87,7 +87,7 @@ def bloom_filter(secret: bytes, ids: Bytes, size: int, among: Integers | int) ->
 
 
 def foreign_share(secret: bytes, ids: Bytes, bloom: bytes, among: Integers | int, gone: float = 0.0) -> float:
-    """Estimated share, 0 to 1, of foreign Gaussians among those with `ids` [M, 16], by the filter `own`.
+    """Estimated share, 0 to 1, of foreign Gaussians among those with `ids` [M, 16], by the filter `bloom`.
 
     `among` [M]: as in `bloom_filter`, if Gaussians count in inverse proportion to it; else the number of its
     Gaussians. 1 if less than a share `gone` of the Bloom filter's sample, rounded down, is there.

@@ -18,7 +18,7 @@ from keyss.files.formats.common import CodedGaussians
 if TYPE_CHECKING:
     from keyss.channels.colours.colours_channel import ColoursReader
 
-SUFFIXES = {"spz": ".spz", "sog": ".sog", "compressed-ply": ".compressed.ply"}  # of quantised formats
+SUFFIXES = {"spz": ".spz", "sog": ".sog", "compressed-ply": ".compressed.ply"}  # quantised formats
 
 
 def channel_for(

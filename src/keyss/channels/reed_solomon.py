@@ -31,7 +31,7 @@ MAX_SHARDS = 1 << 13  # per codeword; the field would allow more, at a cost in t
 SYMBOL_BYTES = 2
 LOST = "the key is right, but too much of the model was lost or changed since the secret was hidden in it"
 _POLYNOMIAL = 0x1100B
-_ORDER = (1 << 16) - 1  # of the generator 2
+_ORDER = (1 << 16) - 1  # order of the generator 2
 _ZERO = 2 * _ORDER  # logarithm of 0: sums with other logarithms are exponents of 0
 _COLUMNS = 128  # per block, which fits into the cache
 _MAX_ERRORS = 128  # maximum number of errors to locate per codeword
@@ -79,7 +79,7 @@ class Codewords:
         """
         inside = np.flatnonzero(numbers < self.shards)
         places = numbers[inside]
-        if len(places) >= self.count * self.k:  # otherwise save the memory
+        if len(places) >= self.count * self.k:  # too few shards cannot be decoded
             first = np.full(self.shards, -1)
             first[places[::-1]] = inside[::-1]
             again = inside[first[places] != inside]

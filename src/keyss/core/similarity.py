@@ -14,7 +14,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, camera_axes, camera_positions, focus_point
 
 _ROTATION_TOLERANCE = 1e-6
-# A shorter mean of unit vectors is no direction: they point everywhere.
+# Minimum length of a mean of unit vectors that gives a direction.
 _MIN_UP = 0.1
 _MIN_HEADING = 0.2
 

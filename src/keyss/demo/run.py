@@ -11,7 +11,7 @@ from keyss.core.arrays import Bytes
 from keyss.files import load_scene
 from keyss.files.atomic import public_mode
 from keyss.fitting import FitConfig, mean_psnr
-from keyss.measure.contact_sheet import contact_sheet
+from keyss.measure.renders import contact_sheet
 from keyss.methods import CarryOptions
 from keyss.progress import Reporter, reporter as default_reporter
 from keyss.rendering import Backend, resolve_device
@@ -27,7 +27,7 @@ OPTIONS = CarryOptions(fit=FitConfig(iterations=400, max_gaussians=10_000, evalu
 WRONG_KEYS = ("open sesame", "0000000000000000", "Demo-key")
 SECRET_PLY, WEB, COMPARISON, KEY, SCENES = "secret.ply", "web.spz", "comparison.png", "key.txt", "scenes"
 VIEWER = "index.html"
-_OPEN_SECONDS = 12.0  # of opening the published files and comparing their pictures
+_OPEN_SECONDS = 12.0  # to open the published files and compare their pictures
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def run_demo(
             viewer = page_with((out / STEGO).read_bytes(), Path(STEGO).name, look)
             files = {SECRET_PLY: revealed, COMPARISON: comparison, KEY: f"{key}\n".encode()}
             results.write(files | {VIEWER: viewer})
-        for name in (VIEWER, WEB):  # what a page needs; they hold published models
+        for name in (VIEWER, WEB):  # pages contain published models
             (out / name).chmod(public_mode())
         return DemoResult(metrics, refused)
     except BaseException as error:

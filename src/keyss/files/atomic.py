@@ -15,6 +15,8 @@ from typing import BinaryIO
 
 from keyss.core.errors import OutputError, UsageError
 
+LEFTOVERS = "lock", "unfinished"  # ends of the names of what a killed write leaves beside its file
+
 
 @contextmanager
 def atomic_write(path: Path | str, mode: int = 0o600) -> Iterator[BinaryIO]:

@@ -29,7 +29,7 @@ _CHECKPOINT = (
 )
 _UNPACK = "unpack it, and give the folder or the model inside"
 START_BYTES = 256  # enough to identify a file
-_META, _MAX_META_BYTES = "meta.json", 1 << 20  # of an unpacked SOG
+_META, _MAX_META_BYTES = "meta.json", 1 << 20  # metadata of an unpacked SOG
 _ZIP, _GZIP = b"PK\x03\x04", b"\x1f\x8b"
 _POSES = "a scene is a folder of photos with their poses, e.g. from COLMAP"
 

@@ -29,14 +29,14 @@ _SCALARS = {
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
 TYPES = {code: name for name, code in reversed(_SCALARS.items())}  # the first name of each code
-_LIST = "l0"  # in place of the code of a list property
-_TEXT = "="  # in place of the byte order of an ascii file, whose tables have the machine's
+_LIST = "l0"  # type code of a list property
+_TEXT = "="  # byte order of an ascii file: its tables have the machine's
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": _TEXT}
 
 # Replaces an infinite opacity logit, which converters write for opacities of 0 and 1. A larger bound would
 # not help, since the float32 sigmoid rounds to exactly 1 from 16.64 on.
 OPACITY_LOGIT_BOUND = 16.0
-LEAST_LOG_SCALE = -87.33654  # of the smallest normal float32; in place of minus infinity
+LEAST_LOG_SCALE = -87.33654  # log of the smallest normal float32; replaces minus infinity
 SAMPLE = 100  # Gaussians from which on `check_not_activated` judges, and about as many that it looks at
 _NEARLY_ALL = 0.99  # share of the scales
 # Values that are all positive are scales, not their logarithms, if half of them are below _SMALL_SCALE, if as

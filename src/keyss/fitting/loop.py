@@ -68,7 +68,7 @@ class TrainingRun(ABC):
     schedule: Schedule
     strategy: CappedStrategy
     density: dict[str, Any]  # the state of `strategy`
-    network_optimizer: torch.optim.Optimizer | None = None  # of `networks`, if there are any
+    network_optimizer: torch.optim.Optimizer | None = None  # optimiser of `networks`
 
     def __init__(self, fit: FitConfig, device: torch.device) -> None:
         self.fit, self.device = fit, device

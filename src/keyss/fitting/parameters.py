@@ -89,6 +89,6 @@ def initial_points(scene: Scene, limit: int, generator: torch.Generator) -> tupl
     cameras = [view.camera for view in scene.train]
     focus = focus_point(cameras)
     distance = camera_positions(cameras).double().sub(focus).norm(dim=1).mean()
-    count = min(limit // 2, 20_000)  # the other half of the cap is for growth
+    count = min(limit // 2, 20_000)  # half of the cap is for growth
     points = focus + (torch.rand(count, 3, generator=generator) - 0.5) * distance
     return points.float(), torch.full((count, 3), 128, dtype=torch.uint8)

@@ -94,7 +94,7 @@ def _target(view: View, size: tuple[int, int], device: torch.device) -> Target:
         image = torch.from_numpy(downscale(image.numpy(), *size))
         if mask is not None:
             shares = downscale(np.uint8(255) * mask.numpy(), *size)
-            mask = torch.from_numpy(shares >= min(128, shares.max()))  # which leaves some pixels
+            mask = torch.from_numpy(shares >= min(128, shares.max()))  # at least one pixel
     return Target.of(image.to(device), mask)
 
 

@@ -24,7 +24,7 @@ _BOOSTED = 0.6  # share of a run with constant, larger rates
 _EXPONENTS = {"means": 7 / 4, "opacities": 1 / 4}  # exponents of the boost; 1 for other attributes
 _LARGE = 0.05  # size / distance to the nearest camera; larger Gaussians get a smaller boost
 _CAMERAS = 32  # cameras used to measure distances
-_LARGE_PHOTO, _COARSEST = 200_000, 20_000  # pixels: of photos that are shrunk, and of shrunk ones at least
+_LARGE_PHOTO, _COARSEST = 200_000, 20_000  # pixels of photos that are shrunk; minimum pixels of shrunk photos
 _FOCAL = 1.15  # focal length / sqrt(image area) at which rates equal 3DGS's; 47 degrees
 
 

@@ -15,7 +15,7 @@ from keyss.kernels.jit import inline, kernel
 from keyss.kernels.parallel import in_blocks
 
 DIGEST_BYTES = 16
-_ROWS = 1 << 13  # at a time
+_ROWS = 1 << 13  # hashed at a time
 _START = np.array(
     [
         0x6A09E667F3BCC908,

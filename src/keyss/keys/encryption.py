@@ -22,8 +22,8 @@ MAX_RATIO, SMALL_PAYLOAD = 16, 1 << 20
 OVERHEAD = 4 + 16  # length of the data, and the tag
 _NONCE = bytes(12)
 _COMPRESSED = 1 << 31  # flag in the length
-_SAMPLES, _SAMPLE_BYTES = 16, 1 << 12  # of a large payload, compressed to find out whether it helps
-_HELPS = 0.97  # maximum size of compressed samples
+_SAMPLES, _SAMPLE_BYTES = 16, 1 << 12  # samples that show whether compression of a large payload helps
+_HELPS = 0.97  # maximum compressed / original size of samples
 
 
 def compressed_size(payload: bytes) -> int:

@@ -18,7 +18,7 @@ from keyss.files.inputs import is_standard
 MAX_KEY_BYTES = 4096
 _TOO_LONG = f"the key is longer than {MAX_KEY_BYTES} bytes"
 ALPHABET = string.ascii_letters + string.digits
-LONG_KEY_LENGTH = 22  # of derived keys and of master keys of sweeps: 131 bits, at 5.95 per character
+LONG_KEY_LENGTH = 22  # characters of derived keys and sweeps' master keys: 131 bits, at 5.95 per character
 # Argon2id costs 0.1 s of a core and 64 MiB per guess: these take three hundred thousand years of one core.
 _ENOUGH_GUESSES = 1e14
 _MAX_RATED = 100  # characters; zxcvbn takes superlinear time

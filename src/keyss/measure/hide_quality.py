@@ -87,7 +87,7 @@ def measure_hiding(
     stego: Gaussians,
     opened: Sequence[HiddenScene],
     scenes: Sequence[Scene],  # the cover, then the secrets in the order of `opened`, each in its own frame
-    shown: Sequence[Shown],  # of `compare`: the stego model, then the secrets
+    shown: Sequence[Shown],  # result of `compare`: the stego model, then the secrets
     baseline: BaselineQuality,
     *,
     wrong_keys: int = WRONG_KEYS,

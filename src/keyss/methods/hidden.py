@@ -16,7 +16,7 @@ from keyss.core.similarity import Similarity
 
 Frame = Literal["secret", "cover"]
 
-FILE = "file"  # in place of a method's name
+FILE = "file"  # method name in the payload of a file
 MAX_NAME_BYTES = 255
 
 

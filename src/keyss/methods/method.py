@@ -20,7 +20,7 @@ from keyss.fitting.config import FitConfig, preset_for
 
 # Per Gaussian of the cover and of a secret (encoding, error correction), and per key.
 _COVER_SECONDS, _KEY_SECONDS = 4e-6, 1.0
-_SECRET_SECONDS = 5e-6, 3e-5  # in a cover that does not grow, and in one that does: precision is searched
+_SECRET_SECONDS = 5e-6, 3e-5  # channels of fixed size; growing ones, whose precision is searched
 _FALLBACK = 'cannot hide this unchanged: {}; falling back to `publish="converted"`, which inspection finds'
 T = TypeVar("T")
 
@@ -129,11 +129,11 @@ class MethodOptions:
     method: ClassVar[str]  # name in files and on the command line, 1 to 15 ASCII characters
 
     fit: FitConfig = field(default_factory=FitConfig)  # plain models, and joint training
-    # "unchanged": the published model must stay as it is; "converted": it may be converted. None: unchanged,
-    # but converted if the secrets do not fit into the cover unchanged.
+    # "unchanged": the published model must stay as it is; "converted": it may be converted. None: "converted"
+    # if the secrets do not fit into the cover unchanged, else "unchanged".
     publish: Publish | None = None
-    format: Format | None = None  # of an unchanged model; None: the cover's
-    # Of a converted model: appended Gaussians hold 6 MB but are visible in the file; colours are less
+    format: Format | None = None  # format of an unchanged model; None: the cover's
+    # Channel of a converted model: appended Gaussians hold 6 MB but are visible in the file; colours are less
     # visible and hold little.
     channel: ConvertedChannel = "appended"
 
@@ -232,12 +232,12 @@ class Prepared:
     """A hiding that a method has checked, with everything that is decided before training."""
 
     options: Any  # as given; the method may complete `fit`
-    fits: tuple[FitConfig, ...]  # of the plain models, the cover first
-    training: tuple[Training, ...]  # the method's own, of each scene
+    fits: tuple[FitConfig, ...]  # fits of the plain models, the cover first
+    training: tuple[Training, ...]  # the method's training of each scene, the cover first
     plan: Plan
     grows: bool = False  # the file grows with the secrets
     survives: bool = False  # the secrets survive conversion to other formats
-    capacity: Any = None  # the method's own view of the cover and what it holds, as large as the model
+    capacity: Any = None  # private to the method: the prepared cover, as large as the model
 
     @staticmethod
     def of(options: MethodOptions, scenes: int, plan: Plan) -> Prepared:

@@ -18,7 +18,7 @@ from keyss.core.gaussians import Gaussians
 _SAMPLE = 4_000  # Gaussians that are looked at
 _SHRINK, _STEPS = 0.87, 60  # ratio of radii, and their number: down to 1/4,000
 _LEAST = 0.08  # share of the weight in the smallest sphere
-# A sphere's weight by this power of its radius: between that of lines, 1, and of clutter around a subject.
+# Exponent of the radius in a sphere's weight: between 1, as of lines, and that of clutter around a subject.
 _GROWTH = 0.87
 _OUTLIERS = 0.995  # share of the weight of a model without surroundings that its sphere holds
 # Ratio of the sizes of Gaussians outside and inside, above which those outside are surroundings.

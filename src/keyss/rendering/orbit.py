@@ -18,8 +18,7 @@ from keyss.core.scene import NEAR, ORDINARY_EXTENT, Camera, Scene, View, checked
 from keyss.files.models import is_model_source
 from keyss.kernels.memory import release
 from keyss.rendering.framing import Frame, frame_of, quantile
-from keyss.rendering.rasterize import MAX_SIDE
-from keyss.rendering.view import render
+from keyss.rendering.rasterize import MAX_SIDE, render
 
 VIEWS = 96
 IMAGE_SIZE = 400  # pixels, width and height
@@ -30,7 +29,7 @@ DISTANCES = (1.0, 0.75, 1.0, 0.5)
 TURNTABLE, _HEIGHT = 60, 0.25  # views; sine of their elevation
 _OUTLIERS, _MARGIN = 0.005, 0.9  # share on either side of a centered subject; part of a view for the subject
 TEST_EVERY, _LARGE = 12, 500_000  # views; minimum Gaussians of a model with slow renders
-_ORBIT_VIEWS, _SCENE_VIEWS, _SIZE = 4, 8, 256  # for comparing models
+_ORBIT_VIEWS, _SCENE_VIEWS, _SIZE = 4, 8, 256  # views and pixels for comparing models
 
 
 def is_model(source: str | Path | Gaussians) -> bool:

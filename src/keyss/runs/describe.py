@@ -54,7 +54,7 @@ class ModelInfo:
     sh_degree: int
     bounding_box: tuple[tuple[float, ...], tuple[float, ...]]  # two corners, in world units
     nearly_transparent: float  # share of the Gaussians with opacities below 0.05
-    capacity: tuple[str, ...] | None = None  # of each way to publish; only on request, as it takes seconds
+    capacity: tuple[str, ...] | None = None  # one per way to publish; only on request, as it takes seconds
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ def _capacities(model: Gaussians) -> Iterator[str]:
             yield f"{flags}: nothing ({error})"
             continue
         sizes = (
-            f"{room.bytes // each:,} Gaussians of SH degree {n}" for n, each in _BYTES_PER_GAUSSIAN.items()
+            f"{room.bytes // size:,} Gaussians of SH degree {n}" for n, size in _BYTES_PER_GAUSSIAN.items()
         )
         yield f"{flags}: {room.bytes:,} bytes, a model of about {' or '.join(sizes)}"
     yield f"--publish converted: {APPENDED.estimate_capacity(0, 0).bytes:,} bytes; the file grows"

@@ -15,7 +15,7 @@ from keyss.files.file_kinds import model_file
 from keyss.files.model_formats import PLY, format_of
 from keyss.files.ply_table import is_plain, read_vertices
 
-_BYTES = 16  # of a Gaussian in a compressed file
+_BYTES = 16  # per Gaussian of a compressed file
 _START = 2.0  # seconds to import what the commands need
 # Processor seconds for a million Gaussians of SH degree 3, on an x86-64 machine; the slowest of one kind.
 _SECONDS = {

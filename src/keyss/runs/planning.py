@@ -22,11 +22,11 @@ from keyss.methods.plain_models import Bound
 from keyss.progress import about
 
 _STEP_SECONDS = {"cpu": 5e-7, "cuda": 6e-9}  # per training step, Gaussian and two pixels
-_VIEW_SECONDS = {"cpu": (1e-7, 8e-7), "cuda": (1e-8, 1e-8)}  # to measure a view, per Gaussian and pixel
+_VIEW_SECONDS = {"cpu": (1e-7, 8e-7), "cuda": (1e-8, 1e-8)}  # per measured view: by Gaussian, by pixel
 _READ_SECONDS = 1.5e-6  # per Gaussian: writing a model, and reading it again
 _CHECKPOINT = 3  # checkpoint / model: parameters and two moments of Adam
 _MAX_APPENDED = 7  # Gaussians that hold one Gaussian of a secret of SH degree 3
-_COPIES = 1  # of what is published and of the secrets in memory, beside the given models
+_COPIES = 1  # copies in memory of the published model and the secrets, beside the given models
 _SHARDS = 7  # copies of appended Gaussians: their shards, coded, placed and read again
 _LONG = 60.0  # seconds; shorter work ends before its cost is read
 _OTHER_BYTES = 2 << 20  # pictures, JSON files, locks
@@ -36,13 +36,13 @@ _OTHER_BYTES = 2 << 20  # pictures, JSON files, locks
 class Cost:
     """Estimates of a run: rough times, disk space of files, and an upper limit of its memory."""
 
-    steps: tuple[int, ...]  # of training, for the cover, then the secrets
+    steps: tuple[int, ...]  # training steps of the cover, then of the secrets
     seconds: float
     fit_seconds: tuple[float, ...]  # plain fits among them, the cover's first
     check_seconds: float  # reading the published file and measuring it
     view_seconds: float  # measuring the cover and the secrets on one test view each
     device: str  # "cpu" or "cuda"
-    disk_bytes: int  # at one time, checkpoints included
+    disk_bytes: int  # maximum, checkpoints included
     memory_bytes: int
 
     @property

@@ -137,8 +137,8 @@ class SecretCheck:
     """Checks of the secret of a key."""
 
     found: int
-    hidden: int  # in all; 0: unknown
-    unit: str  # of both: Gaussians, or bytes of a hidden file
+    hidden: int  # 0: unknown
+    unit: str  # unit of `found` and `hidden`: Gaussians, or bytes of a hidden file
     share: float  # found / hidden
     shards: int | None  # shards of the payload; None if it is not divided
     shards_lost: int | None  # restored by error correction

@@ -17,6 +17,7 @@ from keyss.measure.hide_quality import HidingQuality, RenderFidelity
 from keyss.methods import registry
 from keyss.methods.hidden import HiddenScene
 from keyss.methods.method import MethodOptions
+from keyss.runs.folder import read_manifest
 from keyss.runs.json_records import read_record
 
 OptionsT = TypeVar("OptionsT", bound=MethodOptions)
@@ -48,6 +49,18 @@ class FitRunConfig:
     config: FitConfig
 
 
+def with_seed(config: FitConfig, interrupted: Path | None, *names: str) -> FitConfig:
+    """`config` with a seed: its own, that of the `interrupted` run, or a random one.
+
+    `interrupted`: the run's folder; `names`: the path to its config among its arguments.
+    """
+    running = None if interrupted is None else read_manifest(interrupted).running
+    value: Any = running and running.arguments
+    for name in (*names, "seed"):
+        value = value.get(name) if isinstance(value, dict) else None
+    return config.with_seed(value if isinstance(value, int) else None)
+
+
 def read_config(path: Path) -> RunConfig[MethodOptions]:
     """The configuration of a hiding, with the options of its method. Raises InputError."""
     # Unknown fields are ignored, so this reads the name for every method.
@@ -77,7 +90,7 @@ class HideMetrics(HidingQuality):
     gaussians: int  # Gaussians of the stego model
     photos: tuple[bool, ...]  # cover, then secrets; False: test views are renders of a given model
     secret_gaussians: tuple[int, ...]  # Gaussians of each revealed secret
-    secret_degrees: tuple[tuple[int, int], ...]  # SH degree of each, and of its plain model
+    secret_degrees: tuple[tuple[int, int], ...]  # SH degrees of each secret and of its plain model
     iterations: int  # joint training steps; 0 if the method does not train
     # Total training steps of the cover and of each secret; None: unknown, the plain model was given.
     steps: tuple[int | None, ...]

@@ -4,11 +4,11 @@
  */
 import { tooMuchLost } from '../core/errors.ts';
 
-const ORDER = 65535; // of the generator 2
+const ORDER = 65535; // order of the generator 2
 const ZERO = 2 * ORDER; // logarithm of 0; POWERS of its sums with others are 0
 const MAX_SHARDS = 1 << 13; // per codeword
 const MAX_ERRORS = 128; // per codeword
-const COLUMNS = 64; // of all codewords in a line, restored at a time
+const COLUMNS = 64; // columns of symbols that are restored at a time
 
 const POWERS = new Uint16Array(2 * ZERO + 1);
 const LOGARITHMS = new Uint32Array(ORDER + 1).fill(ZERO);

@@ -17,11 +17,11 @@ export interface CompressedPlyCodes {
   readonly count: number;
   readonly shDegree: number;
   readonly placeBounds: Bounds;
-  readonly scaleBounds: Bounds; // of log scales
+  readonly scaleBounds: Bounds; // bounds of log scales
   readonly colourBounds: Bounds;
   readonly positions: Float64Array; // [N] 11, 10 and 11 bits between the bounds
   readonly scales: Float64Array; // [N] 11, 10 and 11 bits
-  readonly rotations: Float64Array; // [N] index of the component left out (2 bits), then the others (10 bits each)
+  readonly rotations: Float64Array; // [N] index of the component left out (2 bits), then three components (10 bits each)
   readonly colours: Float64Array; // [N] three colours and opacity, 8 bits each
 }
 

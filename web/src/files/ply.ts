@@ -4,7 +4,7 @@ import { InputError } from '../core/errors.ts';
 import { coefficients, COLUMNS, emptyGaussians, type Gaussians, where } from '../core/gaussians.ts';
 
 const MAX_HEADER_BYTES = 65536;
-const ROWS = 4096; // read at a time, so that they stay in the cache
+const ROWS = 4096; // rows per batch, which fit in the cache
 const OPACITY_LOGIT_BOUND = 16; // replaces infinity
 const LEAST_LOG_SCALE = -87.33654; // replaces minus infinity
 

@@ -8,7 +8,7 @@ import { fromSmallestThree, gaussiansOf, holds, mostHeld } from './coded.ts';
 const [LEGACY_BYTES, HEADER_BYTES] = [16, 32];
 const MAX_EXTENSION_BYTES = 1 << 20;
 const [MAX_UNPACKED, GAUSSIAN_BYTES] = [2 ** 31, 65];
-export const [NEGATIVE, MAGNITUDE] = [512, 511]; // of a component of a rotation
+export const [NEGATIVE, MAGNITUDE] = [512, 511]; // masks of a rotation's component
 export const MAX_FRACTIONAL_BITS = 24;
 // Signs of the harmonics of degrees 1 to 3 under (x, y, z) -> (x, -y, -z): SPZ has y up, a .ply y down.
 const SH_SIGNS = [-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1];
@@ -17,7 +17,7 @@ interface Header {
   readonly version: number; // 2 to 4
   readonly count: number;
   readonly shDegree: number;
-  readonly fractionalBits: number; // of positions
+  readonly fractionalBits: number; // fractional bits of positions
 }
 
 /** All integers of a file. */
@@ -28,7 +28,7 @@ export interface SpzCodes extends Header {
   readonly colours: Uint8Array; // [N, 3]
   readonly scales: Uint8Array; // [N, 3] 16ths of log scales
   readonly largest: Uint8Array; // [N] index (xyzw) of the component left out
-  readonly rotations: Uint16Array; // [N, 3] the others: 512 (if negative) + magnitude; version 2: 8 bits
+  readonly rotations: Uint16Array; // [N, 3] components that are stored: 512 (if negative) + magnitude; version 2: 8 bits
   readonly harmonics: Uint8Array; // [N, K - 1, 3]
 }
 

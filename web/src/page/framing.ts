@@ -7,7 +7,7 @@ import {
 const SAMPLE = 4_000; // Gaussians that are looked at
 const [SHRINK, STEPS] = [0.87, 60]; // ratio of radii, and their number: down to 1/4,000
 const LEAST = 0.08; // share of the weight in the smallest sphere
-// A sphere's weight by this power of its radius: between that of lines, 1, and of clutter around a subject.
+// Exponent of the radius in a sphere's weight: between 1, as of lines, and that of clutter around a subject.
 const GROWTH = 0.87;
 const OUTLIERS = 0.995; // share of the weight of a model without surroundings that its sphere holds
 const COARSER = 1.25; // ratio of the sizes of Gaussians outside and inside, above which those outside are surroundings

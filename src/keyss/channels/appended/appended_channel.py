@@ -62,7 +62,7 @@ _OVERHEAD = container.MAX_OVERHEAD + COARSE_BYTES
 # Search for the lattice's offset: Gaussians in which pilots are counted, maximum number of offsets, and
 # standard deviations by which pilots must outnumber accidental ones.
 _SAMPLE, _MAX_OFFSETS, _SIGNIFICANT = 8000, 8, 3.0
-MAX_BYTES = _MAX_PACKETS * _NARROW  # of sealed payloads
+MAX_BYTES = _MAX_PACKETS * _NARROW  # maximum size of a sealed payload
 _VISIBLE_SECRETS = (
     "the number of appended Gaussians reveals the total size: the holder of one key can tell that there are "
     "other secrets"

@@ -32,10 +32,10 @@ SHARE = 1 / 33  # pilots per appended Gaussian
 _PUBLIC = np.uint64(0x6B65797373_617070)  # domain separation of the hash
 ONE_IN = 64  # words per accidental pilot
 _PART_BITS, _PARTS = 16, SALT_BYTES // 2
-_RANDOM_BITS = 3 * COLOUR_BITS - 3 - _PART_BITS  # per pilot, beside a part of the salt and its index
+_RANDOM_BITS = 3 * COLOUR_BITS - 3 - _PART_BITS  # random bits of a pilot
 _TRIES, _MIN_INLIERS = 300, 12  # triples of pilots to try; inliers of a valid similarity
 _SAMPLE = 1024  # pilots to try first, which bounds the time if most are outliers
-_NEAR = 1.5 / 2**POSITION_BITS  # in the own frame
+_NEAR = 1.5 / 2**POSITION_BITS  # maximum distance of an inlier from its place, in the own frame
 
 
 @dataclass(frozen=True)

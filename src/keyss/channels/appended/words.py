@@ -36,9 +36,9 @@ WORD_BITS = INVARIANT_BITS + 3 * (POSITION_BITS + ROTATION_BITS)
 # deviation from the centre. At 1.1/255, 360,000 of them would lower the cover to 40 dB.
 _OPACITY = 1.00001 * DRAWN_OPACITY
 _LOGIT = math.log(_OPACITY / (1 - _OPACITY))
-_FAINTEST, _STRONGEST = 0.4 * DRAWN_OPACITY, 1.6 * DRAWN_OPACITY  # after rounding
+_FAINTEST, _STRONGEST = 0.4 * DRAWN_OPACITY, 1.6 * DRAWN_OPACITY  # opacities of words after rounding
 _COLOUR_STEP = 0.0275  # a little above twice the largest rounding error of formats
-_SCALE_STEP = 0.08  # the same for log scales
+_SCALE_STEP = 0.08  # of log scales; also above twice the largest rounding error
 _MIN_LOG_SCALE = -9.9  # `.spz` stores -10 and more
 _SMALL = -9.0  # smallest log scale, relative to the cube's
 # Bound of x, y and z, so that w is the largest. A step is 16 of `.spz`, which compress better.
@@ -154,9 +154,9 @@ def all_shifts(steps: Doubles) -> Doubles:
 
 def points_in_frame(model: Gaussians, to_own: Similarity) -> tuple[Integers, Integers]:
     """Nearest lattice points [N, 3] of positions and of rotations; `to_own`: world to own frame."""
-    own = to_own.apply_gaussians(model.with_sh_degree(0))
-    positions = own.means.double().numpy() * 2**POSITION_BITS - 0.5
-    parts = with_largest_w(own.quats.double().numpy())[:, 1:]
+    framed = to_own.apply_gaussians(model.with_sh_degree(0))
+    positions = framed.means.double().numpy() * 2**POSITION_BITS - 0.5
+    parts = with_largest_w(framed.quats.double().numpy())[:, 1:]
     rotations = (parts + _ROTATION_REACH) / (2 * _ROTATION_REACH) * 2**ROTATION_BITS - 0.5
     return _nearest(positions, POSITION_BITS), _nearest(rotations, ROTATION_BITS)
 
@@ -225,8 +225,8 @@ def _split(words: Bits) -> list[Doubles]:
     """Colours, scales, positions and rotations, [N, 3] each."""
     fields, at = [], 0
     for width in _WIDTHS:
-        own = words[:, at : at + 3 * width].reshape(-1, 3, width)
-        fields.append(own.astype(np.float64) @ 2.0 ** np.arange(width)[::-1])
+        columns = words[:, at : at + 3 * width].reshape(-1, 3, width)
+        fields.append(columns.astype(np.float64) @ 2.0 ** np.arange(width)[::-1])
         at += 3 * width
     return fields
 

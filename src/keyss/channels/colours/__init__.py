@@ -1,1 +1,1 @@
-"""Colours of Gaussians, changed so little that they survive rounding: bytes that survive other formats."""
+"""Bytes in the colours of Gaussians, which survive conversion to other formats."""

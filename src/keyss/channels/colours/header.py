@@ -1,11 +1,11 @@
 """The header, which tells how to read a payload: in a few Gaussians that the key chooses.
 
-A key is first tried on the header. Under each of a few salts, a part of one fountain code of it is written;
-the parts are decoded together: one salt's Gaussians replace another's lost ones. *Pilots*, a few known bits
-of each part, show which salts are lost; agreement with the decoded bits refines that.
+A key is first tried on the header. A fountain code encodes the header; each of a few salts has a part of the
+code. Decoding all parts together compensates for lost salts. *Pilots*, a few known bits of each part, show
+which salts are lost; agreement with the decoded bits refines that.
 
-A key assigns pseudo-random numbers to IDs and chooses the Gaussians with the smallest, so that a lost
-Gaussian costs its own place only.
+A key assigns pseudo-random numbers to IDs and chooses the Gaussians with the smallest: a lost Gaussian
+displaces no other.
 """
 
 from __future__ import annotations
@@ -110,11 +110,11 @@ class Header:
 
 
 def _read(
-    secrets: Secrets, carriers: Carriers, found: Sequence[tuple[Integers, Flags]], depth: int
+    secrets: Secrets, carriers: Carriers, chosen: Sequence[tuple[Integers, Flags]], depth: int
 ) -> Header | None:
-    """The header with `depth` bits per value of the places `found`."""
+    """The header with `depth` bits per value; `chosen`: see `places`, for each salt."""
     words, hints, owners, odds = [np.zeros(0, np.uint64)], [np.zeros(0)], [np.zeros(0, np.int64)], []
-    for salt, (secret, (rows, pilots)) in enumerate(zip(secrets.salted, found, strict=True)):
+    for salt, (secret, (rows, pilots)) in enumerate(zip(secrets.salted, chosen, strict=True)):
         ids, counts = carriers.ids[rows], np.full(len(rows), depth)
         known = np.repeat(pilots, COLUMNS * depth)
         every = np.repeat(_HELD * carriers.certainty[rows], COLUMNS * depth) * read(

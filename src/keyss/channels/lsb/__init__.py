@@ -1,1 +1,1 @@
-"""Bits that a model has beside what it shows: exact, and lost in every format that rounds them."""
+"""Bytes in the low bits of floats or quantised values, which survive exact copies only."""

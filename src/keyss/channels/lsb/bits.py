@@ -81,12 +81,12 @@ def coarse_lengths(quats: Words32) -> Doubles:
 def gaussian_ids(gaussians: Gaussians, layout: Layout | None = None) -> Bytes:
     """[N, 16] IDs of the Gaussians: public hashes (BLAKE2b) of the bits that embedding never changes."""
     columns = (layout or Layout.of(gaussians)).columns
-    stays = np.full(8 + 3 * gaussians.sh.shape[1], ~np.uint32(0))  # of positions and `used_words`
+    stays = np.full(8 + 3 * gaussians.sh.shape[1], ~np.uint32(0))  # masks of unchanged bits
     stays[3 + columns] = ~LOW | np.uint32(1)
 
     def ids(start: int, stop: int) -> Bytes:
-        own = gaussians[start:stop]
-        words = np.concatenate([bit_patterns(own.means), *group_words(own)], axis=1)
+        block = gaussians[start:stop]
+        words = np.concatenate([bit_patterns(block.means), *group_words(block)], axis=1)
         words &= stays
         return blake2b_rows(words, _PERSON)
 
@@ -119,11 +119,11 @@ def write_low_bits(
         def write(
             start: int, stop: int, depth: int = depth, rows: Integers = rows, data: Bytes = data
         ) -> None:
-            own = rows[start:stop]
-            words, at = np.concatenate([group[own] for group in groups], axis=1), 0
+            block = rows[start:stop]
+            words, at = np.concatenate([group[block] for group in groups], axis=1), 0
             _unpack(words, columns, depth, data[start:stop].copy())
             for group in groups:
-                group[own] = words[:, at : (at := at + group.shape[1])]
+                group[block] = words[:, at : (at := at + group.shape[1])]
 
         in_blocks(write, len(rows), BLOCK, _unpack)
     return written.to(gaussians.device)

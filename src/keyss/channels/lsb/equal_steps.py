@@ -28,18 +28,18 @@ from keyss.files.formats.common import morton_order
 from keyss.kernels.jit import inline, kernel
 from keyss.kernels.parallel import in_blocks
 
-_NEIGHBOURS = 8  # most siblings; detectors that look at 12 find no more than with 12 here
-_EQUAL = 3  # numbers
-_PARTNERS, _WINDOW = 2, 1 << 8  # of a Gaussian among distant ones, and how many are looked at
-_ROWS = 1 << 11  # that a thread takes at a time
+_NEIGHBOURS = 8  # searched for siblings; with 12, detectors that look at 12 find as little
+_EQUAL = 3  # equal steps that exclude a Gaussian
+_PARTNERS, _WINDOW = 2, 1 << 8  # distant siblings per Gaussian, and candidates for them
+_ROWS = 1 << 11  # rows per batch of a thread
 _SAMPLE = 8000  # Gaussians whose pairs of numbers are tested
 _DRAWS = 16
-_PARTS = np.array([[1 / 16], [1 / 8], [1 / 4]])  # of a cell
+_PARTS = np.array([[1 / 16], [1 / 8], [1 / 4]])  # tested distances, in cells
 _ZERO, _COLOURS, _NOTHING = -1, -2, -3  # what a Gaussian is compared with, instead of another one
 _KINDS = _GEOMETRY, _HARMONICS, _BETWEEN_COLOURS = 0, 1, 2
 _FIRST = 16  # place of the harmonics of degrees 1 to 3 among a Gaussian's numbers
-_LANES = 48  # room for them
-_BLOCK = 16  # points that a sweep looks at at once
+_LANES = 48  # padded number of these harmonics
+_BLOCK = 16  # points of a sweep that are compared at a time
 _NAN, _EXPONENT, _MAGNITUDE = np.uint32(0x7FC00000), np.uint32(0x7F800000), np.uint32(0x7FFFFFFF)
 
 
@@ -53,7 +53,7 @@ class Steps:
         means = np.nan_to_num(doubles(gaussians.means), posinf=0, neginf=0)
         near = min(_NEIGHBOURS, max(0, len(means) - 1))
         self.order = morton_order(means.astype(np.float32))  # what neighbours share stays in the cache
-        self.others = np.full((len(means), 2 + near), _ZERO, np.int32)  # that a Gaussian is compared with
+        self.others = np.full((len(means), 2 + near), _ZERO, np.int32)  # candidates for siblings
         self.others[:, 1] = _COLOURS
         if near:
             tree = Neighbours(means, near + 1)
@@ -81,8 +81,8 @@ class Steps:
         moved = np.zeros(len(self.order), bool)
 
         def mark(start: int, stop: int) -> None:
-            own = rows[start:stop]
-            _mark(own, self.others[own], *self.words, depth, moved)
+            block = rows[start:stop]
+            _mark(block, self.others[block], *self.words, depth, moved)
 
         in_blocks(mark, len(rows), _ROWS, _mark)
         _mark(distant[0], distant[1, :, None].astype(np.int32), *self.words, depth, moved)
@@ -98,13 +98,13 @@ class Steps:
 
         rows, random, chances = self.order[usable[self.order]], np.random.default_rng(0), [1.0]
         rows = rows[:: max(1, len(rows) // _SAMPLE)]
-        found, count = np.empty((0, 7), np.uint32), 0
-        while count == len(found):
-            found = np.empty((2 * len(found) + len(rows) + 1, 7), np.uint32)
-            count = _list(rows, self.others[rows][:, 1:], *self.words, depth, found)
+        entries, count = np.empty((0, 7), np.uint32), 0
+        while count == len(entries):
+            entries = np.empty((2 * len(entries) + len(rows) + 1, 7), np.uint32)
+            count = _list(rows, self.others[rows][:, 1:], *self.words, depth, entries)
         for kind in _KINDS:
-            own = found[:count][found[:count, 6] == kind]
-            words, written = own[:, :4], usable[np.tile(own[:, 4:6], 2)]
+            listed = entries[:count][entries[:count, 6] == kind]
+            words, written = listed[:, :4], usable[np.tile(listed[:, 4:6], 2)]
             hits, drawn = _hits(words, depth), np.zeros(len(_PARTS))
             for _ in range(_DRAWS):
                 drawn += _hits(redrawn(words, written, depth, random), depth)
@@ -160,9 +160,9 @@ def _distant_siblings(sh: Words32) -> Integers:
         order, pairs = keys & 0xFFFFFFFF, []
         sums, cells = sums[order], cells[order]
         for other in others:
-            found = np.empty((_PARTNERS * len(order), 2), np.int64)
-            count = _sweep(sums, np.pad(other[order], (0, _BLOCK)), cells, found)
-            pairs.append(order[found[:count].T])
+            partners = np.empty((_PARTNERS * len(order), 2), np.int64)
+            count = _sweep(sums, np.pad(other[order], (0, _BLOCK)), cells, partners)
+            pairs.append(order[partners[:count].T])
         return np.concatenate(pairs, axis=1)
 
     colours = in_blocks(search, 6 if sh.shape[1] > 3 else 0, 1, _sweep)
@@ -179,10 +179,10 @@ def _hits(words: Words32, depth: int) -> Integers:
 
 
 @kernel
-def _sweep(first: Any, second: Any, cells: Any, found: Any) -> int:
-    """List pairs of points (first, second), by ascending `first`, that agree within `cells` [N]; how many.
+def _sweep(first: Any, second: Any, cells: Any, pairs: Any) -> int:
+    """List pairs of points (first, second) that agree within `cells` [N]; return their number.
 
-    `second` [N + _BLOCK]: padded.
+    `first` is ascending; `second` [N + _BLOCK] is padded.
     """
     count = 0
     for one in range(len(first)):
@@ -197,7 +197,7 @@ def _sweep(first: Any, second: Any, cells: Any, found: Any) -> int:
                 if count == most or first[other] - first[one] >= cells[one]:
                     break
                 if abs(second[other] - second[one]) < cells[one]:
-                    found[count, 0], found[count, 1] = one, other
+                    pairs[count, 0], pairs[count, 1] = one, other
                     count += 1
     return count
 
@@ -206,11 +206,11 @@ def _sweep(first: Any, second: Any, cells: Any, found: Any) -> int:
 def _drop_mutual(rows: Any, others: Any) -> None:
     """Keep each pair of mutual neighbours once, in the first row: the other one gets _NOTHING."""
     for one in rows:
-        for each in range(2, others.shape[1]):
-            other = others[one, each]
+        for column in range(2, others.shape[1]):
+            other = others[one, column]
             for its in range(2, others.shape[1] if other < one else 0):
                 if others[other, its] == one:
-                    others[one, each] = _NOTHING
+                    others[one, column] = _NOTHING
 
 
 @inline
@@ -315,10 +315,10 @@ def _mark(rows: Any, others: Any, geometry: Any, sh: Any, depth: int, moved: Any
 
 
 @kernel
-def _list(rows: Any, others: Any, geometry: Any, sh: Any, depth: int, found: Any) -> int:
-    """List two numbers that differ by equal steps in `rows` [R] and `others` [R, K]; how many.
+def _list(rows: Any, others: Any, geometry: Any, sh: Any, depth: int, entries: Any) -> int:
+    """List two numbers that differ by equal steps in `rows` [R] and `others` [R, K]; return how many.
 
-    `found` [M, 7]: first number of both Gaussians, second number, the Gaussians (one for _COLOURS), kind.
+    `entries` [M, 7]: first number of both Gaussians, second number, the Gaussians (one for _COLOURS), kind.
     Lists at most M. Steps of up to two cells are small by chance.
     """
     quats, size, count = geometry.shape[1] // 4, _FIRST + _LANES, 0
@@ -332,12 +332,12 @@ def _list(rows: Any, others: Any, geometry: Any, sh: Any, depth: int, found: Any
             _compare(x, y, depth, known, steps, cells)
             for at in range(size):
                 first, groups = (0, quats) if at < _FIRST else (_FIRST, 3)
-                for each in range(first + (at - first) % groups, at, groups):
-                    if _agree(steps, cells, at, each) and steps[at] > 2 * max(cells[at], cells[each]):
-                        if count == len(found):
+                for second in range(first + (at - first) % groups, at, groups):
+                    if _agree(steps, cells, at, second) and steps[at] > 2 * max(cells[at], cells[second]):
+                        if count == len(entries):
                             return count
-                        entry = found[count]
-                        entry[0], entry[1], entry[2], entry[3] = x[at], y[at], x[each], y[each]
+                        entry = entries[count]
+                        entry[0], entry[1], entry[2], entry[3] = x[at], y[at], x[second], y[second]
                         entry[4], entry[5], entry[6] = one, max(one, other), _GEOMETRY
                         if at >= _FIRST:
                             entry[6] = _HARMONICS if other >= 0 else _BETWEEN_COLOURS

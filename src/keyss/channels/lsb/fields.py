@@ -174,7 +174,7 @@ def _sog_hashes(codes: SogCodes) -> Words:
 
 
 def _fields_of(codes: Codes) -> list[Field]:
-    """The fields of `codes`. Rotations of SPZ 2, which no program writes any more, carry nothing."""
+    """The fields of `codes`. Rotations of SPZ 2 carry nothing."""
     if isinstance(codes, SpzCodes):
         sizes = (_medians(codes.scales) / 16 - 10) * _LOG2_E
         bits = _fitting(sizes[:, None] + codes.fractional_bits + _POSITION_RANGE)

@@ -133,7 +133,7 @@ class LowBitsCover:
         renewed = write_low_bits(rows, self.layout, [(LEAST, self.fresh_salts, fresh)])
         low = read_low_bits(renewed, LEAST, self.layout)
         ids = self.carriers.ids[self.salt_rows]
-        return fresh, [salt(*each) for each in zip(ids, low, strict=True)]
+        return fresh, [salt(*carrier) for carrier in zip(ids, low, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -168,14 +168,14 @@ class Writer:
             left = left[random_order(self.entropy, f"lsb/shards/{attempt}", len(left))]
             bodies = list[Part]()
             for data_key, (_, payload), share in zip(data_keys, payloads, plan.shares, strict=False):
-                own, left = left[: share.carriers], left[share.carriers :]
+                chosen, left = left[: share.carriers], left[share.carriers :]
                 shards = Shards(data_key, share.codewords, is_tagged(noise.shape[1]))
-                if (numbers := shards.numbers(self.ids[own])) is None:
+                if (numbers := shards.numbers(self.ids[chosen])) is None:
                     break
                 record = exact_record(data_key, self.ids)
                 sealed = container.seal(data_key, payload, share.codewords.size, record)
                 contents = share.codewords.encode(sealed)[numbers]
-                bodies.append((plan.depth, own, shards.encrypt(self.ids[own], numbers, contents)))
+                bodies.append((plan.depth, chosen, shards.encrypt(self.ids[chosen], numbers, contents)))
             else:
                 return [(plan.depth, rows, noise), *headers, *bodies]
         raise AssertionError
@@ -191,15 +191,15 @@ class Writer:
         data_keys = [self._secret(f"data-key/{attempt}/{index}", DATA_KEY_BYTES) for index in range(total)]
         width, parts = self.capacity.layout.width(LEAST), list[Part]()
         for index in random_order(self.entropy, f"lsb/headers/{attempt}", total).tolist():
-            own: Sequence[DerivedKey] = [
+            salted: Sequence[DerivedKey] = [
                 DerivedKey(self._secret(f"no-key/{index}/{n}")) for n in range(len(keys[0]))
             ]
             packed = b""
             if index < len(keys):
-                own, code = keys[index], plan.shares[index].codewords
+                salted, code = keys[index], plan.shares[index].codewords
                 packed = container.Parameters(plan.depth, code.count, code.n, code.k).pack(data_keys[index])
             messages = [(parameter_message(data_keys[index], width), packed)]
-            messages += [(key_message(container.key_secret(key), width), data_keys[index]) for key in own]
+            messages += [(key_message(container.key_secret(key), width), data_keys[index]) for key in salted]
             for message, data in messages:
                 rows, contents = message.write(self.ids, data)
                 if index < len(keys):
@@ -236,13 +236,13 @@ class LowBitsReader(SaltedReader):
         width = self.layout.width(LEAST)
         data_key = key_message(container.key_secret(key), width).read(self.ids, self.low)
         packed = parameter_message(data_key, width).read(self.ids, self.low)
-        found = container.Parameters.unpack(packed, data_key)
-        if found is None:
+        parameters = container.Parameters.unpack(packed, data_key)
+        if parameters is None:
             none = Codewords(1, 1, 1, shard_bytes(self.layout.width(DEEPEST)))
             self._shards(data_key, none, DEEPEST)
             raise WrongKeyError()
-        codewords = codewords_of(found, self.layout)
-        numbers, shards = self._shards(data_key, codewords, found.depth)
+        codewords = codewords_of(parameters, self.layout)
+        numbers, shards = self._shards(data_key, codewords, parameters.depth)
         record, payload = container.unseal_shards(data_key, codewords, numbers, shards, EXACT_BYTES)
         return replace(
             payload,

@@ -53,7 +53,7 @@ OVERHEAD = MAX_OVERHEAD + EXACT_BYTES
 class Share:
     """Carriers of a secret at a depth, and the codewords in them."""
 
-    part: float  # of all carriers
+    part: float  # share of all carriers
     carriers: int
     depth: int
     codewords: Codewords
@@ -69,7 +69,7 @@ class Allocation:
     """The division of carriers between payloads."""
 
     depth: int
-    shares: list[Share]  # of each payload
+    shares: list[Share]  # one per payload
     independent: bool  # True if no share depends on other secrets
 
 
@@ -106,12 +106,12 @@ class LowBitsCapacity:
         chosen: list[Share | None] = [shares[index] for index in first_shares(_sizes(shares), sizes) or []]
         independent = bool(chosen)
         if not independent:
-            equal = (each for each in self._equal(len(sizes)) if each.codewords.size >= max(sizes))
+            equal = (share for share in self._equal(len(sizes)) if share.codewords.size >= max(sizes))
             chosen = [next(equal, None)] * len(sizes)
-        own = [share.holding(size) for share, size in zip(chosen, sizes, strict=True) if share]
-        if not own:
+        filled = [share.holding(size) for share, size in zip(chosen, sizes, strict=True) if share]
+        if not filled:
             raise UsageError(self.too_small(max(sizes), len(sizes)))
-        return Allocation(max(share.depth for share in own), own, independent)
+        return Allocation(max(share.depth for share in filled), filled, independent)
 
     def payload_capacity(self, secrets: int) -> int:
         """Maximum bytes of each of `secrets` sealed payloads with equal shares; may be 0."""
@@ -127,10 +127,10 @@ class LowBitsCapacity:
         need = bisect_left(range(_LONGEST * MAX_CODEWORDS), size, key=capacity)
         digits = max(0, len(str(need)) - 2)
         rounded = math.ceil(need / 10**digits) * 10**digits
-        each = "" if secrets == 1 else f" for each of {secrets} secrets"
+        per_secret = "" if secrets == 1 else f" for each of {secrets} secrets"
         return (
-            f"a cover of {self.gaussians:,} Gaussians is too small to carry {size:,} bytes{each} in its low "
-            f"bits; {rounded:,} Gaussians would do"
+            f"a cover of {self.gaussians:,} Gaussians is too small to carry {size:,} bytes{per_secret} in "
+            f"its low bits; {rounded:,} Gaussians would do"
         )
 
     @property

@@ -44,7 +44,7 @@ from keyss.keys.derivation import DerivedKey, expand, fill, stream
 
 LEAST_BYTES = 48  # minimum bytes of a block, which give the salt
 MIN_BLOCKS = 3  # a salt, parameters, and data
-_ATTEMPTS = 30  # to solve all blocks; each fails for at most one cover in a thousand
+_ATTEMPTS = 30  # attempts to solve all blocks; one fails for at most one cover in a thousand
 _BITS_PER_GAUSSIAN = 18  # approximate capacity
 
 
@@ -81,7 +81,7 @@ class QuantisedCover:
     fields: list[Field]
     free: list[Flags]  # [N] per field: levels that may be written
     model_hash: bytes
-    decoded: Decoded | None = None  # in the same order; its model is published instead of the file
+    decoded: Decoded | None = None  # in the order of `codes`; its model is published instead of the file
 
     @staticmethod
     def of(codes: Codes, decoded: Decoded | None = None) -> QuantisedCover:
@@ -199,7 +199,7 @@ class QuantisedCover:
         return codes
 
     def _model_to_publish(self, codes: Codes, entropy: bytes) -> Gaussians:
-        """The model of `codes` in the order of the format or, if the cover has an own one, of the cover."""
+        """The model of `codes` in the order of the format or, if the cover has its own, of the cover."""
         within = random_fractions(entropy, "codes/file-order", 3 * len(codes)).reshape(-1, 3) - 0.5
         order = file_order(codes, within)
         if self.decoded is None:
@@ -245,7 +245,7 @@ class QuantisedReader(SaltedReader):
 
 
 def _capacity(total: int, width: int) -> Capacity:
-    """Of `total` bytes in blocks of `width`: one holds parameters, and the last may not be full."""
+    """The capacity of `total` bytes in blocks of `width`: one holds parameters; the last may not be full."""
     shares = [(1 / part, total // part) for part in (4, 2, 1)]
     return Capacity.of_sealed(2 * width + container.MAX_OVERHEAD, shares, lambda count: total // count)
 

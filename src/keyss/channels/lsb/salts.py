@@ -31,13 +31,14 @@ def salt_rows(gaussians: Gaussians, ids: Bytes, layout: Layout) -> Integers:
     numbers = ids[:, :8].copy().view(">u8")[:, 0].astype(np.uint64)
     rows = np.argpartition(numbers, _FIRST)[:_FIRST] if len(ids) > _FIRST else np.arange(len(ids))
     ranks = _ranks(gaussians[torch.from_numpy(rows)], layout)
-    if (ranks == 0).sum() < SALTS:  # of the smallest IDs too few
+    if (ranks == 0).sum() < SALTS:  # too few among the smallest IDs
         rows, ranks = np.arange(len(ids)), _ranks(gaussians, layout)
     keys = ranks << np.uint64(56) | numbers[rows] >> np.uint64(8)
     best = np.argpartition(keys, SALTS - 1)[:SALTS] if len(keys) > SALTS else np.arange(len(keys))
     low = read_low_bits(gaussians[torch.from_numpy(rows[best])], LEAST, layout)
     places = [
-        (ranks[each], ids[rows[each]].tobytes(), own.tobytes()) for each, own in zip(best, low, strict=True)
+        (ranks[index], ids[rows[index]].tobytes(), bits.tobytes())
+        for index, bits in zip(best, low, strict=True)
     ]
     return rows[best[sorted(range(len(best)), key=places.__getitem__)]]
 

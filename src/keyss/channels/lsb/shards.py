@@ -30,26 +30,26 @@ from keyss.core.arrays import Bytes, Flags, Integers
 from keyss.kernels.parallel import in_blocks
 from keyss.keys.derivation import expand
 
-_CANDIDATES = 8  # Gaussians that are looked at for each place
+_CANDIDATES = 8  # Gaussians considered for each place
 _NUMBER_BYTES = 2
-_LEAST_TAGGED = 5  # bytes of a row from which on it has a tag
+_LEAST_TAGGED = 5  # minimum bytes of a row with a tag
 _PER_GROUP = 32  # codewords of a group whose rows have tags; groups of 2^15 shards hardly differ in size
-_ROWS = 1 << 13  # at a time: what is made of them stays in the cache
+_ROWS = 1 << 13  # rows per batch, whose temporaries fit in the cache
 _BLOCK = 16
 
 
 def function(secret: bytes, label: str, ids: Bytes, size: int = _BLOCK) -> Bytes:
     """[N, size] a pseudo-random function of `ids` [N, 16]; bytes 16 i to 16 i + 15 are AES of (ID xor i)."""
     key, blocks = expand(secret, f"lsb/{label}", 32), -(-size // _BLOCK)
-    found = np.empty((len(ids), size), np.uint8)
+    output = np.empty((len(ids), size), np.uint8)
 
     def work(start: int, stop: int) -> None:
         counted = np.repeat(ids[start:stop, None], blocks, axis=1)
         counted[:, :, -1] ^= np.arange(blocks, dtype=np.uint8)
-        found[start:stop] = encrypted_blocks(key, counted).reshape(stop - start, -1)[:, :size]
+        output[start:stop] = encrypted_blocks(key, counted).reshape(stop - start, -1)[:, :size]
 
     in_blocks(work, len(ids), _ROWS)
-    return found
+    return output
 
 
 def parameter_pads(data_key: bytes, ids: Bytes) -> Bytes:

@@ -22,11 +22,12 @@ import numpy as np
 
 from keyss.core.arrays import Doubles, Integers, Words32
 
-_MAX_ZEROS = 12  # counted at most; numbers with more are rare, or short
+_MAX_ZEROS = 12  # maximum count; numbers with more zeros are rare, or short
 _EXPONENTS = 256
 _NUMBERS = np.arange(1 << _MAX_ZEROS, dtype=np.uint32)[:, None] | np.uint32(1 << _MAX_ZEROS)
 _ZEROS = (_NUMBERS >> np.arange(_MAX_ZEROS + 1, dtype=np.uint32) & 1).argmax(axis=1).astype(np.uint32)
-_UNIFORM = 0.5 ** np.append(np.arange(1, _MAX_ZEROS), _MAX_ZEROS - 1)  # of 1 to 12 zeros of even numbers
+# Probabilities of 1 to 12 trailing zeros in random even numbers.
+_UNIFORM = 0.5 ** np.append(np.arange(1, _MAX_ZEROS), _MAX_ZEROS - 1)
 # Drop of the log-likelihood at the confidence limit: one-sided, one in 200.
 _DROP = 3.3
 _MARGIN, _STEP = 8, 0.25  # range beyond the numbers' exponents and resolution of the search for s; octaves
@@ -41,7 +42,7 @@ def count_trailing_zeros(words: Words32) -> Integers:
 
 
 def least_exponent(counts: Integers, share: float) -> int:
-    """The least exponent e such that even numbers of exponents from e on give away at most `share`.
+    """The least exponent e such that even numbers of exponents from e on leak at most `share`.
 
     `counts`: the result of `count_trailing_zeros`. `share`: maximum squared separation (d') of the plain file
     and the file with new bits.
@@ -55,7 +56,7 @@ def least_exponent(counts: Integers, share: float) -> int:
     likelihoods = (even * np.log(chances)).sum(axis=(1, 2))
     likely = np.flatnonzero(likelihoods >= likelihoods.max() - _DROP)
     chosen = likely[-1]
-    if likely[0] == 0:  # nothing excludes that no zeros are forced; too few numbers may exclude nothing
+    if likely[0] == 0:  # perhaps no zeros are forced, or there are too few numbers to tell
         numbers = counts[present].sum(axis=1).cumsum()
         most = present[np.searchsorted(numbers, numbers[-1] / 2)] - _LARGEST
         chosen = min(chosen, max(0, np.searchsorted(scales, most)))

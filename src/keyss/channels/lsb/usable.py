@@ -14,7 +14,7 @@ A Gaussian is excluded as a whole, so that its numbers stay consistent, because 
 - *Short numbers*, five in a Gaussian, as of models in half precision.
 - *Small even numbers*, which an optimiser may have left on a coarser grid: see `trailing_zeros`.
 
-docs/threat-model.md tells what each hides.
+docs/threat-model.md has measurements.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ _MIN_USABLE = 0.05  # share of the Gaussians of a cover
 _SHORT = 5  # numbers without low bits; by chance in one of ten million Gaussians
 _SETS_BY_CHANCE = 0.1  # maximum expected number of sets of equal values by chance
 _SAMPLE = 20_000  # Gaussians whose bits are tested
-_MANTISSAS, _WINDOW = 1 << 22, 1 << 16  # without the last bit; of one spectrum
-_SMOOTH = 1 << 10  # lowest frequencies, of the distribution of all numbers
+_MANTISSAS, _WINDOW = 1 << 22, 1 << 16  # distinct mantissas without the last bit; mantissas of one spectrum
+_SMOOTH = 1 << 10  # frequencies that the distribution of the numbers fills
 _LARGE = 10 * _SAMPLE  # Gaussians of a cover whose sample is tested first
 _CHANCE = 1e-6  # probability of refusing a depth of a model with uniform bits
 
@@ -75,7 +75,7 @@ class Carriers:
 
     ids: Bytes  # [N, 16] of all Gaussians
     usable: Flags  # [N] mask of those in which new low bits do not show
-    depth: int  # up to which they do not
+    depth: int  # maximum depth at which new low bits do not show
     renewable: Flags  # [N] mask of those that may be written at the least depth, as salts are
 
     @staticmethod
@@ -231,16 +231,16 @@ def _without_small_even(gaussians: Gaussians, layout: Layout, counted: Flags) ->
     groups, fine = layout.groups(gaussians), np.ones(len(gaussians), bool)
 
     def count(start: int, stop: int) -> Integers:
-        own = counted[start:stop]
-        return np.stack([count_trailing_zeros(words[start:stop][own]) for words in groups.values()])
+        mask = counted[start:stop]
+        return np.stack([count_trailing_zeros(words[start:stop][mask]) for words in groups.values()])
 
     counts = np.sum(in_blocks(count, len(fine), BLOCK), axis=0)
-    least = [least_exponent(each, MAX_SEPARATION / len(ATTRIBUTES)) for each in counts]
+    least = [least_exponent(histogram, MAX_SEPARATION / len(ATTRIBUTES)) for histogram in counts]
 
     def compare(start: int, stop: int) -> None:
         for words, bound in zip(groups.values(), least, strict=True):
-            own = words[start:stop]
-            fine[start:stop] &= ~((exponents(own) < bound) & (own & 1 == 0)).any(axis=1)
+            block = words[start:stop]
+            fine[start:stop] &= ~((exponents(block) < bound) & (block & 1 == 0)).any(axis=1)
 
     in_blocks(compare, len(fine), BLOCK)
     return fine

@@ -6,8 +6,8 @@ derived from the cover, which only the writer has.
 
 Coincidences are more frequent than by chance. Trainers start with round Gaussians, some with rotations by 0
 degrees, and where few views show them they stay nearly so. Clones start with equal rotations and scales.
-Writing would spread all of these. Of each kind of coincidence a random part stays, the excess over chance:
-writing makes as many of the others as it spreads.
+Writing would destroy these coincidences, so a random subset of each kind stays untouched, as large as the
+excess over chance.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ _OFF_LATTICE = 0.24  # minimum mean distance from a lattice, in steps; by chance
 _ROUGH, _DEVIATIONS = 0.25, 6  # an excess that is ignored: relative, and in standard deviations
 _NAMES = ("positions", "rotations", "scales")  # attributes that carry bits in any format
 _LEVELS = (0.5, 1.5, 2.5, 3.5, 5.5, 7.5, 15.5)  # upper ends of the bins of differences of levels
-_LOG_SCALES: Doubles = np.exp2(LOG_SCALE_RANGE + np.arange(-6.0, 2.0))  # and of log scales
+# Upper ends of the bins of differences of log scales.
+_LOG_SCALES: Doubles = np.exp2(LOG_SCALE_RANGE + np.arange(-6.0, 2.0))
 
 
 def writable_levels(codes: Codes, fields: list[Field], fixed: Flags, secret: bytes) -> list[Flags]:

@@ -66,8 +66,8 @@ def palette_of(vectors: Floats, size: int) -> tuple[Floats, Shorts]:
 
     def centred(some: Floats) -> Doubles:
         with np.errstate(over="ignore"):
-            found: Doubles = np.nan_to_num(some - mean).astype(np.float64)
-        return found
+            differences: Doubles = np.nan_to_num(some - mean).astype(np.float64)
+        return differences
 
     sample = centred(vectors[:: max(1, len(vectors) // _SAMPLE)])
     _, axes = np.linalg.eigh(sample.T @ sample)

@@ -292,7 +292,7 @@ def from_smallest_three(largest: Bytes, others: Doubles) -> Doubles:
     return quats
 
 
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # than the largest
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # indices other than the largest component's
 
 
 def in_morton_order(model: Gaussians) -> Gaussians:

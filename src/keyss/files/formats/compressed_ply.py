@@ -39,7 +39,7 @@ _BOUNDS = [
     for end in ("min", "max")
     for name in names.split()
 ]
-_COLOR_BOUNDS = np.repeat(np.array([0, 1], np.float32), 3)  # of old files, which do not state them
+_COLOR_BOUNDS = np.repeat(np.array([0, 1], np.float32), 3)  # defaults of files without colour bounds
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 
@@ -52,7 +52,7 @@ class CompressedPlyCodes(Codes):
     bounds: Floats  # [C, 18] min, then max of x y z; log scales; r g b (f_dc * SH_C0 + 0.5)
     positions: Shorts  # [N, 3] 11, 10 and 11 bits, between the bounds
     largest: Bytes  # [N] index of the component of wxyz left out
-    rotations: Shorts  # [N, 3] 10 bits each, the other components from -sqrt(1/2) to sqrt(1/2)
+    rotations: Shorts  # [N, 3] components that are stored, 10 bits each, from -sqrt(1/2) to sqrt(1/2)
     scales: Shorts  # [N, 3] 11, 10 and 11 bits, between the bounds
     colors: Bytes  # [N, 3] between the bounds
     alphas: Bytes  # [N] opacities in 255ths
@@ -96,7 +96,7 @@ class CompressedPlyCodes(Codes):
         packed[:, 1] = self.largest.astype(np.uint32) << 30 | _pack_fields(self.rotations, (10, 10, 10))
         packed[:, 2] = _pack_fields(self.scales, VECTOR)
         packed[:, 3] = _pack_fields(self.colors, (8, 8, 8)) << np.uint32(8) | self.alphas
-        has_colors = bool((self.bounds[:, 12:] != _COLOR_BOUNDS).any())  # not in old files
+        has_colors = bool((self.bounds[:, 12:] != _COLOR_BOUNDS).any())  # optional
         names = _BOUNDS if has_colors else _BOUNDS[:12]
         elements = {
             "chunk": (len(self.bounds), [f"float {name}" for name in names]),

@@ -51,7 +51,7 @@ _TURN = (0.0, 0.0, 1.0, 0.0)  # 180 degrees about z, xyzw
 _MAX_JSON_BYTES = 1 << 20  # parsed, JSON takes up to 80 times as much memory
 _MAX_DEPTH = 64  # nested nodes
 _MAX_PARTS = 64  # primitives with Gaussians, each counted once per node
-_VALUES_PER_BYTE = 4  # of all Gaussians; more where attributes share bytes, or nodes a mesh
+_VALUES_PER_BYTE = 4  # maximum; accessors that share bytes, and nodes that share a mesh, exceed it
 
 
 class _Accessor(msgspec.Struct, omit_defaults=True):

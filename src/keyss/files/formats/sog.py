@@ -93,7 +93,7 @@ class SogCodes(Codes):
     maxs: Doubles  # [3]
     positions: Shorts  # [N, 3] 65535ths between the bounds
     largest: Bytes  # [N] index of the component of wxyz left out
-    rotations: Bytes  # [N, 3] the other components, from -sqrt(1/2) to sqrt(1/2)
+    rotations: Bytes  # [N, 3] components that are stored, from -sqrt(1/2) to sqrt(1/2)
     scale_codebook: Floats  # [256] log scales
     scales: Bytes  # [N, 3] codebook indices
     color_codebook: Floats  # [256] f_dc

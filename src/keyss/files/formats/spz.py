@@ -147,8 +147,8 @@ def _unpack_gzip(data: bytes) -> tuple[_Header, bytes, bytes]:
     except zlib.error as error:
         raise InputError(f"damaged SPZ: {reason(error)}") from error
     if len(body) < size or not stream.eof:
-        found = "fewer" if len(body) < size or not stream.unconsumed_tail else "more"
-        raise not_whole("SPZ", f"expected {size:,} bytes of {header.gaussians:,} Gaussians, found {found}")
+        amount = "fewer" if len(body) < size or not stream.unconsumed_tail else "more"
+        raise not_whole("SPZ", f"expected {size:,} bytes of {header.gaussians:,} Gaussians, found {amount}")
     return header, body[:size], body[size:] if header.flags & EXTENSIONS else b""
 
 
@@ -201,7 +201,7 @@ class SpzCodes(Codes):
     colors: Bytes  # [N, 3] f_dc in steps of 1/38.25; 127.5 is 0
     scales: Bytes  # [N, 3] log scales in 16ths from -10 on
     largest: Bytes  # [N] index of the component of xyzw left out; always 3 in version 2
-    # [N, 3] the other components: 512 (if negative) + magnitude in 511ths of sqrt(1/2); version 2: 8 bits
+    # [N, 3] stored components: 512 (if negative) + magnitude in 511ths of sqrt(1/2); version 2: 8 bits
     rotations: Shorts
     sh: Bytes  # [N, K - 1, 3] harmonics in 128ths from -1 on
     extensions: bytes = b""  # not parsed

@@ -13,9 +13,9 @@ from keyss.fitting.config import FitConfig
 from keyss.methods.codec.precision import finest_size, prune_to_size, usual_size
 from keyss.rendering.orbit import Viewpoints
 
-# Of a secret that is not fitted yet: with the usual precision, at SH degree 0, and with the finest precision.
+# Of a secret that is not fitted yet: usual precision, the same at SH degree 0, finest precision.
 _BITS_PER_GAUSSIAN = 150, 90, 210
-_SAMPLE, _FAR_TOO_LARGE = 10_000, 1.5  # Gaussians; times what can be appended
+_SAMPLE, _FAR_TOO_LARGE = 10_000, 1.5  # Gaussians of a sample; size / what can be appended
 _TINY = 16  # Gaussians; secrets are not pruned to fewer
 
 

@@ -38,7 +38,7 @@ class CarryOptions(MethodOptions):
         return self.fine_tune != "never"
 
     def fits(self, scenes: int) -> list[FitConfig]:
-        """By default, secrets get the steps of fine-tuning in addition, which they do without."""
+        """See `MethodOptions`. Secrets by default train for the steps of fine-tuning in addition."""
         if self.iterations is not None:
             return [self.fit] * scenes
         secret = replace(self.fit, iterations=round((1 + FINE_TUNING) * self.fit.iterations))

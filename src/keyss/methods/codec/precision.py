@@ -16,8 +16,8 @@ from keyss.rendering.orbit import Viewpoints, psnr_between
 
 _GOOD_ENOUGH = 43.75  # dB between renders; costs 0.1 to 0.3 dB at 30 dB against photos
 _ATTRIBUTES = ("means", "log_scales", "opacity_logits", "colours", "quats", "harmonics")
-# Shares of the squared error, proportional to counts of nonzero numbers: at the optimum, a finer step gains
-# the same per bit for each attribute.
+# Shares of the squared error, proportional to counts of nonzero numbers: at the optimum, a bit gains as much
+# in every attribute.
 _SHARES = (3, 3, 1, 3, 3, 18)
 _TRIES, _CLOSE, _BIT = 6, 0.15, 6.02  # dB
 _COARSEST = 0.1  # maximum step of harmonics, whose errors are invisible from afar

@@ -34,15 +34,14 @@ from keyss.keys.derivation import SALT_BYTES, expand, stream
 from keyss.methods.hidden import Frame, HiddenScene, Recovered
 from keyss.methods.keyss.decoder import Decoder
 from keyss.methods.keyss.keyss_options import DecoderShape, KeyssOptions, parse_mask
-from keyss.methods.keyss.training import KeyssTraining
+from keyss.methods.keyss.training import KeyssTraining, PlacedScene
 from keyss.methods.method import Capabilities, Context, Prepared, Source, Stego
-from keyss.methods.placed_scene import PlacedScene
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
 NAME = "keyss"
 FORMAT, VERSION = "keyss-secret", 1
 ANCHORS = 64
-ANCHORS_NEEDED = 0.25  # minimum share found
+ANCHORS_NEEDED = 0.25  # minimum share of the anchors that are Gaussians of the model
 ANCHOR_TOLERANCE = 1e-6  # fraction of the model's size
 _SLACK = 0.01  # share of the Gaussians that rounding may make visible or invisible
 _WEIGHTS = "decoder."

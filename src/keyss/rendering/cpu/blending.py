@@ -79,7 +79,7 @@ from keyss.rendering.cpu.simd8 import (
     sum_lanes_of_8,
 )
 
-ANCHOR_ROWS = 8  # rows between two evaluations of exp, see above
+ANCHOR_ROWS = 8  # rows between two evaluations of exp
 UNROLLED_ROWS = 4  # blended without a branch, which would cost more than an empty row
 PLANE = TILE_PIXELS + (UNROLLED_ROWS - 1) * TILE_WIDTH  # includes room for unrolled rows below the tile
 BATCH = 16  # Gaussians between two tests for a full tile

@@ -14,8 +14,7 @@ import { COARSE_BYTES, coarseForeign } from '../foreign.ts';
 import type { Codewords, Shards } from '../reed_solomon.ts';
 import { LEAST, ONE_IN, type PilotData, pilotsOf, POSITION_BITS, readPilots } from './pilots.ts';
 
-// Gaussians sampled for pilots; number of lattice offsets tried, with at least this many standard deviations more pilots
-// than by chance.
+// Gaussians sampled for pilots; maximum number of lattice offsets tried; minimum excess of pilots, in standard deviations.
 const [SAMPLE, TRIED, NOT_BY_CHANCE] = [8000, 8, 3];
 
 /** A model's appended Gaussians, prepared for any number of keys. */

@@ -11,7 +11,7 @@ const [COLOUR_NOISE, OPACITY_NOISE] = [0.344, 1.02]; // maximum rounding error, 
 const SCALE_NOISE = 0.144;
 const [RATIO_BIN, OPACITY_BIN, RED_BIN] = [4, 8, 3]; // steps
 const MIN_OPACITY = 2.5 / 255;
-const BINS = 30_000; // on either side of zero
+const BINS = 30_000; // bins on either side of zero
 const ID_VALUES = 8; // values of an ID: four, zero-padded to a block of AES
 
 /** C Gaussians as a reader sees them. */
@@ -82,7 +82,7 @@ export function fractions(secret: Uint8Array, label: string, ids: Int16Array): F
   });
 }
 
-const SALTS = 16; // at most
+const SALTS = 16; // maximum number of salts
 const BANDS = [0.08, 0.4, 1.01]; // limits of two opacity bands with half of the salts each
 const [SALT_OPACITY_BIN, SALT_RATIO_BIN, SALT_COLOUR_BIN] = [16, 8, 5]; // steps
 const LABEL = ascii('keyss/v1/colours-salt');

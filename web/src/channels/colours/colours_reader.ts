@@ -10,7 +10,7 @@ import { keySecret, type Payload, type Reader, unsealed } from '../container.ts'
 import { type Carriers, carriersOf, chosen, fractions, randomPairs, saltsOf } from './carriers.ts';
 import { Fountain, NOISY } from './fountain.ts';
 
-const CHANGED = 0.03; // share of carriers overwritten since
+const CHANGED = 0.03; // share of carriers that are overwritten after hiding
 const MAX_RATE = 4; // data bits per code bit
 const ALIGNMENTS = 4; // offsets of log scales tried
 const [FOREIGN, DEVIATIONS] = [0.25, 4]; // share of foreign carriers that is told; standard errors
@@ -124,14 +124,14 @@ interface Secrets {
 
 /** Parameters for reading a payload. */
 interface Header {
-  readonly key: Uint8Array; // of the payload
+  readonly key: Uint8Array; // data key of the payload
   readonly partition: Uint8Array; // assigns carriers to parts
-  readonly level: number; // of `bitCounts`
-  readonly first: number; // of SHARES that the payload has,
-  readonly last: number; // this one included
+  readonly level: number; // see `bitCounts`
+  readonly first: number; // first of the payload's parts of the carriers, below SHARES
+  readonly last: number; // last part, inclusive
   readonly size: number; // bytes of the payload
-  readonly occupancy: number; // share of its carriers in use
-  readonly median: number; // of impacts when it was written, in MEDIAN_STEPS, without multiples of 256
+  readonly occupancy: number; // share of the payload's carriers in use
+  readonly median: number; // median impact at hiding, in MEDIAN_STEPS, modulo 256
 }
 
 /** Null if there is none; one attempt in 2^16 finds one by chance, which opens nothing. */
@@ -227,9 +227,9 @@ function packBits(bits: Uint8Array): Uint8Array {
 
 const COLUMNS = 2; // modulated values per Gaussian
 const ONE = 0; // level at which every value carries one bit
-const MAX_BITS = 5; // per value
-const SPACING = 0.0275; // between neighbouring points
-const BIT = Math.log(4); // in impact; a level is a quarter of a bit
+const MAX_BITS = 5; // maximum bits per value
+const SPACING = 0.0275; // distance of neighbouring points
+const BIT = Math.log(4); // impact per bit; a level is a quarter of a bit
 const MIDDLE = 24; // level at which an impact of zero carries nothing
 const NOISE = 0.23; // standard deviation of rounding, in spacings
 const POINTS = [-1, 0, 1, 2]; // candidate points, relative to the one below

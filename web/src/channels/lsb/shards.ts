@@ -12,7 +12,7 @@ import type { Codewords, Shards } from '../reed_solomon.ts';
 const BLOCK = 16; // bytes of a block of AES
 const CANDIDATES = 8; // Gaussians that are looked at for each place
 const NUMBER_BYTES = 2;
-const LEAST_TAGGED = 5; // bytes of a row from which on it has a tag
+const LEAST_TAGGED = 5; // minimum bytes of a row with a tag
 const PER_GROUP = 32; // codewords of a group whose rows have tags
 
 /** [N, size] a pseudo-random function of `ids` [N, 16]. */
