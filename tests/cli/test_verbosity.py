@@ -70,9 +70,7 @@ class TestEstimate:
         assert re.search(rf"^fit: {self.WORDS}\n.*fit b: 20 steps", result.err, re.DOTALL)
         assert "about" not in fit(keyss, scene, "-q", "--overwrite").err
 
-    def test_hide(
-        self, keyss: Run, workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_hide(self, keyss: Run, workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(planning, "_LONG", 0.0)
         hide = ("hide", *scene_arguments(workspace), "--publish", "converted", "-o", tmp_path / "out")
         result = keyss(*hide, *SMALL, "--min-psnr", 0)
