@@ -152,3 +152,12 @@ def test_resize_element(
             tab.page.evaluate("style => { document.querySelector('keyss-viewer').style = style }", style)
             if "none" not in style:
                 assert_drawn(tab, secret)
+
+
+def test_panel_fits_a_phone_held_sideways(chromium: Any, page_file: Path) -> None:
+    with visit(chromium, viewport=LANDSCAPE, **PHONE) as tab:
+        tab.goto(page_file.as_uri())
+        tab.page.tap("#keying > summary")
+        assert tab.page.is_visible("#key")
+        bottom = "document.querySelector('#controls').getBoundingClientRect().bottom"
+        assert tab.page.evaluate(f"{bottom} <= window.innerHeight")

@@ -17,11 +17,11 @@ export const page = {
   ...all<HTMLImageElement>()('poster'),
 };
 
-const NARROW = '(max-width: 600px)'; // the panel would cover the scene
+const SMALL = '(max-width: 600px), (max-height: 500px)'; // the panel would cover the scene, or be cut
 
 /** `opened` receives chosen and dropped files. */
 export function preparePanel(opened: (file: File) => void): void {
-  page.controls.open = page.keying.open = !window.matchMedia(NARROW).matches;
+  page.controls.open = page.keying.open = !window.matchMedia(SMALL).matches;
   if (!page.keying.open) page.controls.name = page.keying.name = 'folded'; // of one name, one is open at a time
   page.fullscreen.hidden = !document.fullscreenEnabled;
   page.fullscreen.addEventListener('click', () => {
