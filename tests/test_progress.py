@@ -124,6 +124,16 @@ def test_long_waits_are_logged(monkeypatch: pytest.MonkeyPatch) -> None:
     assert text(log) == before
 
 
+def test_short_waits_together_are_logged(timer: Timer) -> None:
+    log = console(False)
+    lines = ProgressLines(log, timer=timer)
+    for _ in range(4):
+        timer.now += 4
+        with lines.waiting("hiding", 3):
+            time.sleep(0.1)
+    assert len(text(log).splitlines()) == 1
+
+
 def test_only_long_waits_are_displayed_in_terminals(monkeypatch: pytest.MonkeyPatch) -> None:
     screen = console(True)
     with ProgressLines(screen).waiting("nothing to do", 100):

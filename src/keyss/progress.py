@@ -15,7 +15,7 @@ from rich.text import Text
 
 level = 0  # -1: silent, 1: more often; set by the command line
 _DELAY_SECONDS = 1.0  # before a terminal displays a wait
-# In logs: before the first line of a long wait; between lines, and before the first line of a short wait.
+# In logs: before the first line of a long wait; between lines.
 _QUIET_SECONDS, _WAIT_SECONDS = 2.0, 10.0
 _PRIOR = 0.1  # weight of an estimated time in the pace of a wait, relative to all of its work
 
@@ -66,6 +66,7 @@ class ProgressLines(Reporter):
         self.live = console.is_terminal
         self.every = (0.25 if self.live else 10.0) if every is None else every
         self.timer = timer
+        self.noted = timer()
         self.task: Task | None = None
 
     def start(self, title: str, iterations: int, iteration: int) -> None:
@@ -116,13 +117,15 @@ class ProgressLines(Reporter):
             self.note(_joined(f"{task.description}: {how} {duration}", self.numbers))
 
     def note(self, line: str) -> None:
+        self.noted = self.timer()
         self.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     @contextmanager
     def waiting(self, what: str, seconds: float) -> Iterator[Share]:
-        """See `Reporter`. A terminal displays a moving sign after 1 s; logs get a line every 10 s.
+        """See `Reporter`. A terminal displays a moving sign after 1 s.
 
-        The first line of a long wait is logged after 2 s.
+        Logs get a line 2 s into a long wait, and whenever the last line is 10 s old, also that of an
+        earlier wait.
         """
         wait = Wait(what, seconds * _crowding(), self.timer)
         ended = threading.Event()
@@ -133,7 +136,9 @@ class ProgressLines(Reporter):
                     with self.console.status(wait, refresh_per_second=4):
                         ended.wait()
                 return
-            pause = _QUIET_SECONDS if wait.seconds > _WAIT_SECONDS else _WAIT_SECONDS
+            pause = self.noted + _WAIT_SECONDS - self.timer()
+            if wait.seconds > _WAIT_SECONDS:
+                pause = min(pause, _QUIET_SECONDS)
             while not ended.wait(pause):
                 self.note(str(wait))
                 pause = max(_WAIT_SECONDS, self.every)

@@ -32,14 +32,20 @@ if TYPE_CHECKING:
 # Columns of the table of a hiding, with what its legend says of them.
 _HEADS = {
     "PSNR": "PSNR in dB",
-    "SSIM": "",
+    "SSIM": "SSIM: 1 if equal",
     "LPIPS": "LPIPS (AlexNet): lower is better",
     "bound": "bound: PSNR of plain 3DGS with the same steps",
     "loss": "loss: bound - PSNR",
     "start": "start: PSNR of a plain model with fewer steps, no bound (`keyss hide --bound` fits one)",
     "Gaussians": "",
     "plain": "plain: Gaussians of the plain model",
-    "steps": "",
+    "steps": "steps: training steps",
+}
+# What `info` says of a number.
+_MEANINGS = {
+    "bounding_box": "{}: two corners, in the model's units",
+    "nearly_transparent": "{} of the Gaussians, those with opacities below 0.05",
+    "extent": "{}: distance of the farthest camera from their middle plus a tenth, in the scene's units",
 }
 _ROUNDED = 20 * math.log10(255 * math.sqrt(12))  # PSNR of the error of rounding to 8 bits
 _SHOWS = 1.0  # dB below the secret at which a wrong key shows as much
@@ -185,8 +191,13 @@ def print_info(described: RunInfo | InterruptedRun | ModelInfo | SceneInfo) -> N
     if not isinstance(described, RunInfo):
         facts = {name: value for name, value in vars(described).items() if value is not None}
         capacity = facts.pop("capacity", ())
-        rows = [(name.replace("_", " "), _text(value)) for name, value in facts.items()]
+        rows = [
+            (name.replace("_", " "), _MEANINGS.get(name, "{}").format(_text(value)))
+            for name, value in facts.items()
+        ]
         _print_columns([*rows, *(("capacity", line) for line in capacity)])
+        if "bounding_box" in facts:
+            print("`keyss info --capacity` says what it can hide, and `keyss verify` checks it.")
         return
     from keyss.runs.run_records import HideMetrics
 
@@ -227,8 +238,6 @@ def print_conversion(out: Path, conversion: Conversion, *, dry_run: bool) -> Non
         f"{out}: {len(conversion.gaussians):,} Gaussians, {_size(conversion.bytes_after)}{was}, {renders}",
         file=file,
     )
-    if out.name.lower().endswith(".spz"):
-        print("y is up in an .spz: programs that do not turn it show it upside down", file=file)
     for number, secret in enumerate(conversion.secrets, 1):
         which = "the secret" if len(conversion.secrets) == 1 else f"the secret of key {number}"
         state = "survives" if secret.kept else f"is lost: {secret.after:,} {secret.unit} are left"

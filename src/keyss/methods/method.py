@@ -221,8 +221,8 @@ class Plan:
     @property
     def room(self) -> str:
         """What fits, as a phrase."""
-        rough = "about " if self.prunes else ""
-        return f"room for {rough}{self.capacity:,} of the {self.secret_gaussians:,} Gaussians to hide"
+        rough, whole = ("about ", ", with all their harmonics") if self.prunes else ("", "")
+        return f"room for {rough}{self.capacity:,} of the {self.secret_gaussians:,} Gaussians to hide{whole}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -47,7 +47,7 @@ class Cost:
     @property
     def where(self) -> str:
         """The device, for messages."""
-        return "the GPU" if self.device == "cuda" else "the CPU"
+        return "an idle GPU" if self.device == "cuda" else "an idle CPU"
 
     def __str__(self) -> str:
         return (

@@ -171,9 +171,13 @@ def _note(capacity: CarryCapacity, appended: int, *, pruned: bool) -> str:
             f"up to {appended:,} invisible Gaussians are appended to the cover's {capacity.gaussians:,}; "
             "fewer Gaussians or a lower SH degree of a secret take less"
         )
-    how = "about" if capacity.prepared is None else "exactly"
+    how, fitted = "exactly", ""
+    if capacity.prepared is None:
+        how, fitted = "about", "; once the cover is fitted, it may be half of that, or a third more"
     flatter = "; a secret keeps more Gaussians if a lower SH degree shows more of it" * pruned
-    return f"the {capacity.channel.place} have room for {how} {capacity.payloads.bytes:,} bytes{flatter}"
+    return (
+        f"the {capacity.channel.place} have room for {how} {capacity.payloads.bytes:,} bytes{fitted}{flatter}"
+    )
 
 
 METHOD = CarryMethod()
