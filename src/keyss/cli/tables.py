@@ -121,7 +121,7 @@ def print_plan(method: str, plan: Plan, cost: Cost) -> None:
     """Print capacity and estimates of a run."""
     of = [f"{role_of(index, len(cost.steps))} {steps:,}" for index, steps in enumerate(cost.steps)]
     training = [("training", f"steps: {', '.join(of)}")] if any(cost.steps) else []
-    _print_columns(
+    print_columns(
         [
             ("method", method),
             ("capacity", plan.room),
@@ -195,7 +195,7 @@ def print_info(described: RunInfo | InterruptedRun | ModelInfo | SceneInfo) -> N
             (name.replace("_", " "), _MEANINGS.get(name, "{}").format(_text(value)))
             for name, value in facts.items()
         ]
-        _print_columns([*rows, *(("capacity", line) for line in capacity)])
+        print_columns([*rows, *(("capacity", line) for line in capacity)])
         if "bounding_box" in facts:
             print("`keyss info --capacity` says what it can hide, and `keyss verify` checks it.")
         return
@@ -221,7 +221,7 @@ def print_verification(checked: Verification) -> None:
         what = f"{secret.found:,}{of} {secret.unit}: {'; '.join(secret.problems) or 'complete'}"
         rows.append(("secret" if len(checked.secrets) == 1 else f"secret of key {number}", what))
     about_model = f"{model.gaussians:,} Gaussians of SH degree {model.sh_degree}: {problems}"
-    _print_columns([("model", about_model), *(rows or [("secret", "not checked, as no key was given")])])
+    print_columns([("model", about_model), *(rows or [("secret", "not checked, as no key was given")])])
 
 
 def print_conversion(out: Path, conversion: Conversion, *, dry_run: bool) -> None:
@@ -264,7 +264,7 @@ def print_files(folder: Path, names: Mapping[str, str]) -> None:
     if progress.level < 0:
         print(*(path for path, _ in results), sep="\n")
     else:
-        _print_columns(results)
+        print_columns(results)
 
 
 def print_written(path: Path, text: str) -> None:
@@ -275,22 +275,22 @@ def print_written(path: Path, text: str) -> None:
     )
 
 
-def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
+def print_columns(rows: Sequence[tuple[str, str]]) -> None:
     """Print two columns of plain text. Paths are never wrapped."""
     width = max((len(name) for name, _ in rows), default=0)
     for name, text in rows:
         print(f"{name:<{width}}  {text}")
 
 
-def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], *, texts: int = 1) -> None:
-    """Print a table; its first `texts` columns are aligned left, the others hold numbers.
+def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a table; its first column is aligned left, the others hold numbers.
 
     Cells wrap between words. If the terminal is too narrow, each row becomes a list.
     """
     console, rows = Console(), list(rows)
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
     for index, head in enumerate(heads):
-        table.add_column(head, justify="left" if index < texts else "right", overflow="fold")
+        table.add_column(head, justify="right" if index else "left", overflow="fold")
     for row in rows:
         table.add_row(*map(Text, row))
     unlimited = console.options.update(max_width=10**6)
