@@ -6,7 +6,6 @@ import time
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from keyss.core.errors import InputError
 from keyss.core.scene import Scene, ViewOptions
@@ -17,21 +16,9 @@ from keyss.fitting.plain import FitResult, fit_scene
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import CONFIG, METRICS, MODEL, PathLike, as_scene, path_of
-from keyss.runs.folder import RunFolder, read_manifest
+from keyss.runs.folder import RunFolder
 from keyss.runs.planning import check_room, cost_of_fit
-from keyss.runs.run_records import FitMetrics, FitRunConfig
-
-
-def with_seed(config: FitConfig, interrupted: Path | None, *names: str) -> FitConfig:
-    """`config` with a seed: its own, that of the `interrupted` run, or a random one.
-
-    `interrupted`: the run's folder; `names`: the path to its config among its arguments.
-    """
-    running = None if interrupted is None else read_manifest(interrupted).running
-    value: Any = running and running.arguments
-    for name in (*names, "seed"):
-        value = value.get(name) if isinstance(value, dict) else None
-    return config.with_seed(value if isinstance(value, int) else None)
+from keyss.runs.run_records import FitMetrics, FitRunConfig, with_seed
 
 
 def fit(

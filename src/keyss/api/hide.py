@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 
-from keyss.api.fit import with_seed
 from keyss.api.hide_arguments import (
     Given,
     HideResult,
@@ -57,7 +56,7 @@ from keyss.runs.files import (
 from keyss.runs.folder import RunFolder
 from keyss.runs.json_records import record_bytes
 from keyss.runs.planning import check_room, cost_of
-from keyss.runs.run_records import RunConfig, secret_ids
+from keyss.runs.run_records import RunConfig, secret_ids, with_seed
 
 
 def hide(

@@ -11,7 +11,7 @@ from keyss.core.arrays import Bytes
 from keyss.files import load_scene
 from keyss.files.atomic import public_mode
 from keyss.fitting import FitConfig, mean_psnr
-from keyss.measure.contact_sheet import contact_sheet
+from keyss.measure.renders import contact_sheet
 from keyss.methods import CarryOptions
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device

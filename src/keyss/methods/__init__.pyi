@@ -1,5 +1,8 @@
-from .carry.carried_secret import CarriedSecret as CarriedSecret
-from .carry.carry_method import embed_models as embed_models, most_contributing as most_contributing
+from .carry.carry_method import (
+    CarriedSecret as CarriedSecret,
+    embed_models as embed_models,
+    most_contributing as most_contributing,
+)
 from .carry.carry_options import CarryOptions as CarryOptions
 from .codec.precision import (
     choose_precision as choose_precision,

@@ -36,7 +36,7 @@ METHODS = {
         "the secrets' Gaussians, encrypted in the cover's",
         "keyss.methods.carry.carry_options:CarryOptions",
         "keyss.methods.carry.carry_method:METHOD",
-        "keyss.methods.carry.carried_secret:CarriedSecret.of",
+        "keyss.methods.carry.carry_method:CarriedSecret.of",
     ),
     "keyss": Modules(
         "one model and a decoder for all keys, trained jointly",

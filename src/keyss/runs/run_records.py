@@ -17,6 +17,7 @@ from keyss.measure.hide_quality import HidingQuality, RenderFidelity
 from keyss.methods import registry
 from keyss.methods.hidden import HiddenScene
 from keyss.methods.method import MethodOptions
+from keyss.runs.folder import read_manifest
 from keyss.runs.json_records import read_record
 
 OptionsT = TypeVar("OptionsT", bound=MethodOptions)
@@ -46,6 +47,18 @@ class FitRunConfig:
     scene: str | None
     views: ViewOptions
     config: FitConfig
+
+
+def with_seed(config: FitConfig, interrupted: Path | None, *names: str) -> FitConfig:
+    """`config` with a seed: its own, that of the `interrupted` run, or a random one.
+
+    `interrupted`: the run's folder; `names`: the path to its config among its arguments.
+    """
+    running = None if interrupted is None else read_manifest(interrupted).running
+    value: Any = running and running.arguments
+    for name in (*names, "seed"):
+        value = value.get(name) if isinstance(value, dict) else None
+    return config.with_seed(value if isinstance(value, int) else None)
 
 
 def read_config(path: Path) -> RunConfig[MethodOptions]:

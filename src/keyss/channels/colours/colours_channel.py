@@ -102,7 +102,7 @@ class ColoursCover:
         if plan is None:
             raise UsageError(
                 f"the colours of this cover hold {self.planner.bytes:,} bytes of one secret, and less of "
-                f"several; the given take {sum(sizes) - OVERHEAD * len(sizes):,}"
+                f"several; the given secrets take {sum(sizes) - OVERHEAD * len(sizes):,}"
             )
         layouts, reveals_others = plan
         if reveals_others:

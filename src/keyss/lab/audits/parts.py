@@ -30,9 +30,8 @@ from keyss.lab.robustness.survival import ChangeResult, measure_robustness
 from keyss.lab.stealth.judging import StealthResult, judge
 from keyss.lab.stegexpose import stegexpose_auc
 from keyss.lab.two_sample import two_sample_auc
-from keyss.measure.contact_sheet import contact_sheet
 from keyss.measure.hide_quality import WrongKeys
-from keyss.measure.renders import renders_of, select_views
+from keyss.measure.renders import contact_sheet, renders_of, select_views
 from keyss.methods.method import role_of
 
 QUALITY_LOSS = 1.0  # dB of cover or secret below the plain model of the same scene

@@ -22,8 +22,7 @@ from keyss.lab.audits.trial_measures import CONVERSIONS
 from keyss.lab.many.result_tables import TrialNumbers, write_scene_tables
 from keyss.lab.many.trial import opened_run
 from keyss.lab.many.trial_folder import Forecast, Outcome, TrialFolder
-from keyss.measure.contact_sheet import contact_sheet
-from keyss.measure.renders import renders_of
+from keyss.measure.renders import contact_sheet, renders_of
 from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device

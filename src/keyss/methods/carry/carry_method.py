@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import warnings
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 from keyss.channels import Channel, Payload, PreparedCover, open_payload
-from keyss.core.errors import UsageError
+from keyss.core.errors import KeyssWarning, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
@@ -15,9 +18,10 @@ from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.schedule import boost_of
 from keyss.methods.carry.capacity import CarryCapacity, SecretSize, check_appended
-from keyss.methods.carry.carried_secret import CarriedSecret
 from keyss.methods.carry.carry_options import FINE_TUNING, CarryOptions
+from keyss.methods.codec.model_bytes import decode
 from keyss.methods.codec.precision import encode_to_size, finest_size
+from keyss.methods.hidden import Frame, HiddenScene, Recovered
 from keyss.methods.method import (
     Capabilities,
     Context,
@@ -40,6 +44,46 @@ _FINE_TUNED_SHARE = 0.97  # Gaussians fine-tuned / Gaussians that fit: fine-tuni
 # Least shares of a secret's Gaussians. Public models fine-tuned with fewer are below 30 dB; with fewer than
 # the second, and than so many Gaussians, below 20 dB or as far from the plain model as empty renders.
 _MIN_SHARE, _HOPELESS_SHARE, _HOPELESS = 1 / 6, 1 / 100, 500
+
+
+@dataclass(frozen=True)
+class CarriedSecret(HiddenScene):
+    """A carried secret."""
+
+    payload: Payload
+    frame = None
+
+    @staticmethod
+    def of(payload: Payload) -> CarriedSecret:
+        """Read a payload. Raises InputError for damage."""
+        secret = CarriedSecret(payload)
+        _ = secret.gaussians
+        return secret
+
+    @cached_property
+    def gaussians(self) -> Gaussians:
+        """Decoded when it is first needed: until then, a secret takes a fifth of the memory."""
+        return decode(self.payload.data, self.payload.model_size)
+
+    def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
+        """All Gaussians of the secret."""
+        if force:
+            warnings.warn(
+                "`force=True` has no effect: this secret opens whole or not at all",
+                KeyssWarning,
+                stacklevel=2,
+            )
+        if frame == "cover":
+            raise UsageError(
+                'a carried secret has no position in the cover\'s coordinates: leave out `frame="cover"`'
+            )
+        return self.gaussians
+
+    def recovered(self, revealed: Gaussians) -> Recovered:
+        return Recovered(len(revealed), len(revealed), self.payload.shards)
+
+    def fingerprint(self) -> str:
+        return hashlib.sha256(self.gaussians.means.numpy().tobytes()).hexdigest()[:16]
 
 
 class CarryMethod:
@@ -241,8 +285,8 @@ def embed_models(
         for limit, views in zip(capacity.limits(needed), viewpoints, strict=True)
     ]
     stego = cover.embed(list(zip(keys, payloads, strict=True)), entropy=entropy)
-    opened = [CarriedSecret(open_payload(stego, key)) for key in keys]
-    if [secret.payload.data for secret in opened] != [payload.data for payload in payloads]:
+    read = list(map(partial(open_payload, stego), keys))
+    if [payload.data for payload in read] != [payload.data for payload in payloads]:
         raise RuntimeError("the embedded secrets do not open again as they should")
     sizes = [len(payload.data) for payload in payloads]
     details: dict[str, Any] = {
@@ -253,4 +297,4 @@ def embed_models(
     if not capacity.grows:
         details["capacity_bytes"] = capacity.bytes
         details["capacity_bits_per_gaussian"] = round(8 * capacity.bytes / len(cover.cover), 2)
-    return Stego(stego, tuple(opened), details=details, verified=True)
+    return Stego(stego, tuple(map(CarriedSecret, read)), details=details, verified=True)

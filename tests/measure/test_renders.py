@@ -7,7 +7,7 @@ import io
 import numpy as np
 from PIL import Image
 
-from keyss.measure.contact_sheet import contact_sheet
+from keyss.measure.renders import contact_sheet
 
 
 def test_headings_fit() -> None:
