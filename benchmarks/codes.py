@@ -1,6 +1,6 @@
 """Capacity and cost of carrying in quantised values: the tables of docs/channels.md.
 
-    python benchmarks/codes.py --data FOLDER --pair bonsai=cover.ply,fox=secret.ply --write docs/channels.md
+    python benchmarks/codes.py --data FOLDER --pair bonsai=cover.ply,fox=secret.ply
     python benchmarks/codes.py --files FOLDER --format spz bonsai=a.ply bonsai=b.ply fox=c.ply ...
     python benchmarks/stealth.py --quick --pairs $(cat FOLDER/pairs)
 
@@ -22,7 +22,6 @@ from pathlib import Path
 from keyss.channels import SUFFIXES, Payload, QuantisedChannel, QuantisedReader
 from keyss.channels.lsb.fields import FORMATS
 from keyss.core import Gaussians, Scene
-from keyss.files import write_bytes
 from keyss.files.formats.common import in_morton_order
 from keyss.files.models import read_model, write_model
 from keyss.files.scenes import load_scene
@@ -31,7 +30,6 @@ from keyss.methods import encode_to_size, most_visible, prune_to_size
 from keyss.methods.codec.model_bytes import decode, encode
 from keyss.rendering.orbit import psnr_between, scene_of_model
 
-START, END = "<!-- measured by benchmarks/codes.py -->", "<!-- end of what was measured -->"
 HEAD = (
     "| cover | Gaussians | format | bits per Gaussian | cover against photos, untouched / carrying (dB) "
     "| untouched against carrying (dB) | secret Gaussians per cover Gaussian "
@@ -54,11 +52,10 @@ def against_photos(model: Gaussians, scene: Scene) -> float:
     return mean_psnr(model, scene.test, scene.background)
 
 
-def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path, width: int) -> list[str]:
-    """A row of the table for each format."""
+def print_rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path, width: int) -> None:
+    """Print a row of the table for each format."""
     own = most_visible(secret[1].with_sh_degree(0), len(cover[1]) // SHARE)
     scenes = [scene_for(data / name, model, width) for name, model in (cover, secret)]
-    found = []
     for name, format_ in FORMATS.items():
         model = in_morton_order(cover[1])
         untouched = format_.quantise(model).dequantise()
@@ -80,13 +77,12 @@ def rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data: Path
             *(against_photos(each, scenes[0]) for each in (untouched, stego)),
             *(against_photos(each, scenes[1]) for each in (in_format, opened)),
         ]
-        found.append(
+        print(
             f"| {cover[0]} | {len(model):,} | {stego.codes.name} | {bits:.1f} "
             f"| {numbers[0]:.2f} / {numbers[1]:.2f} | {psnr_between(untouched, stego):.1f} "
-            f"| 1 : {1 / most:.1f} | {numbers[2]:.2f} / {numbers[3]:.2f} | {hiding:.1f}, {revealing:.1f} |"
+            f"| 1 : {1 / most:.1f} | {numbers[2]:.2f} / {numbers[3]:.2f} | {hiding:.1f}, {revealing:.1f} |",
+            flush=True,
         )
-        print(found[-1], flush=True)
-    return found
 
 
 def files(folder: Path, format_name: str, models: list[str]) -> None:
@@ -114,21 +110,16 @@ def main() -> None:
     parser.add_argument("--files", type=Path, metavar="FOLDER")
     parser.add_argument("--format", choices=tuple(FORMATS), default="spz")
     parser.add_argument("--width", type=int, default=200, help="width of renders in pixels")
-    parser.add_argument("--write", type=Path, help="page to write the table to, between two marks")
     arguments = parser.parse_args()
     if arguments.files:
         files(arguments.files, arguments.format, arguments.models)
     if not arguments.pair:
         return
-    table = [HEAD]
+    print(HEAD)
     for pair in arguments.pair:
         cover, secret = (part.partition("=")[::2] for part in pair.split(","))
         models = [(name, read_model(path)) for name, path in (cover, secret)]
-        table += rows(models[0], models[1], arguments.data, arguments.width)
-    if arguments.write:
-        before, _, rest = arguments.write.read_text().partition(START)
-        page = before + "\n".join([START, "", *table, "", END]) + rest.partition(END)[2]
-        write_bytes(arguments.write, page.encode())
+        print_rows(models[0], models[1], arguments.data, arguments.width)
 
 
 if __name__ == "__main__":

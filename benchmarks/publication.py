@@ -1,6 +1,6 @@
 """Quality of a hiding after conversion by third-party programs: the table of docs/channels.md.
 
-    python benchmarks/publication.py RUN --key-file key.txt [--sog-iterations 10] [--only NAME ...]
+    python benchmarks/publication.py RUN --key-file key.txt [--only NAME ...]
 
 RUN: a folder of `keyss hide --publish converted` with one secret. Each program converts the published model
 and the cover's plain model to each format; the secret is revealed from the converted file. PSNR in dB against
@@ -55,7 +55,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--key-file", type=Path, required=True)
-    parser.add_argument("--sog-iterations", type=int, default=1)
     parser.add_argument("--only", nargs="*", metavar="NAME", help='such as ".spz by gsply" (default: all)')
     asked = parser.parse_args()
     run = open_run(asked.run, [asked.key_file.read_text().strip()])
@@ -68,7 +67,7 @@ def main() -> None:
     print("| what | MB, plain / published (ratio) | cover, plain / published (dB) | secret (dB) |")
     print("| --- | --- | --- | --- |")
     print(row(run, "`.ply`, as published", None), flush=True)
-    for converter in converters(asked.sog_iterations):
+    for converter in converters():
         name = f"{converter.format} by {converter.tool}"
         if asked.only and name not in asked.only:
             continue

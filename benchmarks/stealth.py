@@ -3,7 +3,6 @@
     python benchmarks/stealth.py bonsai=a.ply bonsai=b.ply fox=c.ply ...  # plain, of three scenes or more
     python benchmarks/stealth.py ... --fine-tuned bonsai=stego.ply:secret.ply  # files, secrets' models
     python benchmarks/stealth.py --pairs bonsai=plain.ply:stego.ply ...     # given files
-    python benchmarks/stealth.py ... --rounded   # models like those of trainers that round steps
     python benchmarks/stealth.py ... --quick     # two random parts of each model, no candidates
 
 Each plain model is made to carry as much of a model of the next scene as fits, and random bytes. Statistics
@@ -33,7 +32,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from channels.lsb.payloads import embed_derived
-from channels.lsb.trained_like import keys, rounded
+from channels.lsb.trained_like import keys
 from keyss.channels import LOW_BITS
 from keyss.core import Gaussians, UsageError
 from keyss.fitting import FitConfig
@@ -69,7 +68,6 @@ class Job:
     scene: str
     path: str
     secret: str
-    rounded: bool
 
 
 def main() -> None:
@@ -99,7 +97,6 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("plain", nargs="*", metavar="SCENE=FILE")
     parser.add_argument("--fine-tuned", nargs="*", default=[], metavar="SCENE=FILE:SECRET")
     parser.add_argument("--pairs", nargs="*", default=[], metavar="SCENE=PLAIN:STEGO")
-    parser.add_argument("--rounded", action="store_true")
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     return parser.parse_args()
@@ -118,15 +115,13 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
     for index, (scene, path) in enumerate(plain):
         others = [each for named, each in plain if named != scene]
         # The secret is of another scene, and a different model each time if there are enough.
-        jobs.append(Job(index, scene, path, others[(7 * index + 3) % len(others)], options.rounded))
+        jobs.append(Job(index, scene, path, others[(7 * index + 3) % len(others)]))
     return jobs
 
 
 def _make(job: Job) -> list[File]:
     """The plain model, and files that hide something; nothing for a cover that hiding refuses."""
     cover = read_model(job.path)
-    if job.rounded:
-        cover = rounded(cover, job.index)
     made = [File("plain", job.scene, job.path, cover)]
     try:
         capacity = CarryCapacity.of(LOW_BITS, cover, FitConfig())

@@ -123,10 +123,10 @@ def png_names(cameras: Iterable[Camera]) -> list[str]:
     return list(names)
 
 
-def animation_bytes(images: Sequence[Tensor], seconds: float = 6.0) -> bytes:
-    """An endless animation of uint8 images [H, W, 3], as WebP."""
+def animation_bytes(images: Sequence[Tensor]) -> bytes:
+    """An endless animation of uint8 images [H, W, 3] in 6 seconds, as WebP."""
     first, *others = (Image.fromarray(image.numpy()) for image in images)
-    file, duration = io.BytesIO(), round(1000 * seconds / len(images))
+    file, duration = io.BytesIO(), round(6000 / len(images))
     first.save(file, "WEBP", save_all=True, append_images=others, duration=duration, loop=0, quality=80)
     return file.getvalue()
 

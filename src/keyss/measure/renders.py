@@ -33,12 +33,12 @@ def renders_of(model: Gaussians, cameras: Sequence[Camera], background: Tensor) 
     return renders
 
 
-def sheet_of(columns: Sequence[tuple[str, str, Scene, Gaussians]], views: int = 3) -> bytes:
-    """A PNG of test views: for each role, kind of the scene's images, scene and model, image and render."""
+def sheet_of(columns: Sequence[tuple[str, str, Scene, Gaussians]]) -> bytes:
+    """A PNG of three test views: images and renders, by role, kind of the images, scene and model."""
     heads: list[str] = []
     pictures: list[list[Bytes]] = []
     for role, kind, scene, model in columns:
-        shown = subsample_views(scene.test, views)
+        shown = subsample_views(scene.test, 3)
         renders = renders_of(model, [view.camera for view in shown], scene.background)
         heads += [f"{role}, {kind}", f"{role}, {'published' if not heads else 'revealed'}"]
         pictures += [[view.image.numpy() for view in shown], [image.numpy() for _, image in renders]]

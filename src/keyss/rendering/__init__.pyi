@@ -5,11 +5,13 @@ from .orbit import (
     psnr_between as psnr_between,
     scene_of_model as scene_of_model,
 )
-from .rasterize import Backend as Backend, rasterization as rasterization, resolve_device as resolve_device
-from .view import (
+from .rasterize import (
+    Backend as Backend,
     contributions as contributions,
     decode_picture as decode_picture,
+    rasterization as rasterization,
     render as render,
     render_features as render_features,
     render_with_meta as render_with_meta,
+    resolve_device as resolve_device,
 )

@@ -18,8 +18,7 @@ from keyss.core.scene import NEAR, ORDINARY_EXTENT, Camera, Scene, View, checked
 from keyss.files.models import is_model_source
 from keyss.kernels.memory import release
 from keyss.rendering.framing import Frame, frame_of, quantile
-from keyss.rendering.rasterize import MAX_SIDE
-from keyss.rendering.view import render
+from keyss.rendering.rasterize import MAX_SIDE, render
 
 VIEWS = 96
 IMAGE_SIZE = 400  # pixels, width and height

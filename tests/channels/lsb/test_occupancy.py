@@ -15,12 +15,11 @@ from keyss.channels import LEAST, Layout, LowBitsCapacity, Parameters, Payload, 
 from keyss.channels.container import key_secret
 from keyss.channels.lsb.low_bits import Writer
 from keyss.channels.lsb.low_bits_capacity import codewords_of, key_message, parameter_message
-from keyss.channels.lsb.salts import SALTS
 from keyss.core import KeyssWarning
 
 CARRIERS, LAYOUT = 4000, Layout(3)
 IDS = np.random.default_rng(0).integers(0, 256, (CARRIERS, 16), np.uint8)
-OWN = keys(0)
+KEYS = [keys(seed) for seed in range(5)]
 HIDINGS = 40
 CAPACITY = LowBitsCapacity(CARRIERS, CARRIERS, LAYOUT, LEAST)
 QUARTER = CAPACITY.for_payloads().shares[0][1]  # bytes that fit into a quarter of these carriers
@@ -32,9 +31,9 @@ def _seen(sizes: Sequence[int]) -> list[float]:
     payloads = [Payload("test", os.urandom(size)) for size in sizes]
     writer = Writer(CAPACITY, np.ones(CARRIERS, bool), IDS, os.urandom(32))
     low = np.empty((CARRIERS, LAYOUT.width(LEAST)), np.uint8)
-    for _, rows, data in writer.write([([k] * SALTS, each) for k, each in zip(OWN, payloads, strict=False)]):
+    for _, rows, data in writer.write(list(zip(KEYS, payloads, strict=False))):
         low[rows, : data.shape[1]] = data
-    message = key_message(key_secret(OWN[0]), low.shape[1])
+    message = key_message(key_secret(KEYS[0][0]), low.shape[1])
     data_key = message.read(IDS, low)
     places, contents = message.write(IDS, data_key)
     own_key = (low[places, :16] == contents).all(axis=1)

@@ -107,11 +107,6 @@ def test_all_methods_fail(
         raise InputError("the disk is full")
 
     monkeypatch.setattr(trial, verb, full)
-
-    def refuse(*_: object) -> None:
-        raise UsageError("no room")
-
-    monkeypatch.setattr(type(registry.get("carry")), "prepare", refuse)
     command = ["compare", "--cover", str(folders[0]), "--secret", str(folders[1]), *SMALL, "-o", str(out)]
     assert main([*command, "--methods", "3dgs"]) == 4
     said = capsys.readouterr()

@@ -53,13 +53,11 @@ class Converter:
         return Change(attack, 1, sentence, lambda model: self(model).to(model.device))
 
 
-def converters(sog_iterations: int = 1) -> list[Converter]:
+def converters() -> list[Converter]:
     """All known conversions, whether or not their tools are installed.
 
-    `sog_iterations`: rounds of clustering harmonics in .sog; splat-transform's default is ten, at half a
-    minute each for 20,000 Gaussians without a GPU.
+    Harmonics in .sog are clustered in one round, of half a minute for 20,000 Gaussians; ten are usual.
     """
-    rounds = "one round" if sog_iterations == 1 else f"{sog_iterations} rounds"
     return [
         Converter("compressed .ply", "gsply", "", _gsply_compressed),
         Converter(".spz", "gsply", " (version 3)", _gsply_spz),
@@ -68,8 +66,8 @@ def converters(sog_iterations: int = 1) -> list[Converter]:
         Converter(
             ".sog",
             "splat-transform",
-            f", with {rounds} of clustering harmonics",
-            _through("there.sog", "-i", str(sog_iterations)),
+            ", with one round of clustering harmonics",
+            _through("there.sog", "-i", "1"),
         ),
         Converter(".splat", "splat-transform", ", which only reads this format", _splat),
     ]

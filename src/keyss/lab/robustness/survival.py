@@ -19,7 +19,6 @@ from keyss.methods.hidden import HiddenScene
 PRUNED = (0.05, 0.10, 0.15, 0.25, 0.50)
 NOISE = (0.001, 0.01, 0.1)
 _STEPS_TO_MEASURE = 100  # training steps that take as long as measuring a change
-CHANGES, TRAINING_STEPS = 48, 1100  # of `default_changes`, without converters
 SEEDS = 3  # repetitions per random removal; results vary by a dB or two
 
 # Opens a secret in a stego model on the CPU; raises KeyssError if it does not open.
