@@ -59,8 +59,7 @@ def _keyss(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.delenv("KEYSS_DEBUG", raising=False)
     monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.setattr("sys.stdin", io.StringIO())
-    for pause in ("_QUIET_SECONDS", "_WAIT_SECONDS"):  # slow machines print no further lines
-        monkeypatch.setattr(f"keyss.progress.{pause}", 1e6)
+    monkeypatch.setattr("keyss.progress._LOG_SECONDS", 1e6)  # slow machines print no further lines
 
     def run(*arguments: object) -> Result:
         capsys.readouterr()

@@ -22,6 +22,7 @@ import keyss
 from keyss import CarryOptions, FitConfig, Secret, SecretFile
 from keyss.cli import main
 from keyss.core import InputError, OutputError, Scene, UsageError, WrongKeyError
+from keyss.progress import Reporter
 from tiny_scenes import HEIGHT, WIDTH, random_gaussians, tiny_scene
 
 CONFIG = CarryOptions(
@@ -29,6 +30,14 @@ CONFIG = CarryOptions(
     fine_tune="always",
 )
 ANY = replace(CONFIG, publish="converted")  # so small a cover has no room
+
+
+def test_progress_is_shown_by_default(capsys: pytest.CaptureFixture[str]) -> None:
+    config = replace(CONFIG.fit, iterations=2)
+    keyss.fit(tiny_scene(0), config=config)
+    assert "2 steps" in capsys.readouterr().err
+    keyss.fit(tiny_scene(0), config=config, reporter=Reporter())
+    assert capsys.readouterr().err == ""
 
 
 def write_nerfstudio(

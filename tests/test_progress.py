@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import time
 
 import pytest
@@ -46,21 +47,54 @@ def test_clock(seconds: float, shown: str) -> None:
     assert clock(seconds) == shown
 
 
+def wait_for(log: Console, words: str) -> None:
+    for _ in range(500):
+        if words in text(log):
+            return
+        time.sleep(0.02)
+    raise AssertionError(f"{words} not in {text(log)}")
+
+
 def test_log_lines(timer: Timer) -> None:
     log = console(False)
-    lines = ProgressLines(log, timer=timer)
+    lines = ProgressLines(log, every=0.01, timer=timer)
     lines.start("hide", 300, 0)
     for iteration in range(1, 101):
-        timer.now += 0.25
         lines.update(iteration, 12345, {"PSNR cover": 25.127})
+        timer.now += 0.25
+        if iteration % 40 == 0:
+            wait_for(log, f"hide: {iteration}/300, ")
     lines.finish()
     lines.finish()
-    assert text(log).splitlines() == [
-        "hide: 300 steps",
-        "hide: 40/300, 4.0 it/s, 1:05 left, 12,345 Gaussians, PSNR cover 25.13",
-        "hide: 80/300, 4.0 it/s, 0:55 left, 12,345 Gaussians, PSNR cover 25.13",
-        "hide: stopped at 100 in 0:25, 12,345 Gaussians, PSNR cover 25.13",
-    ]
+    first, *shown, last = text(log).splitlines()
+    assert first == "hide: 300 steps"
+    line = r"hide: 40/300, [34]\.\d it/s, 1:\d\d left, 12,345 Gaussians, PSNR cover 25.13"
+    assert any(re.fullmatch(line, each) for each in shown), shown
+    assert last == "hide: stopped at 100 in 0:25, 12,345 Gaussians, PSNR cover 25.13"
+
+
+def test_first_steps_are_not_silent() -> None:
+    """The first step compiles kernels, which takes long on a busy machine."""
+    log = console(False)
+    lines = ProgressLines(log, every=0.01)
+    lines.start("hide", 300, 0)
+    wait_for(log, "hide: 0/300, starting")
+    lines.finish()
+    before = text(log)
+    time.sleep(0.05)
+    assert text(log) == before
+
+
+def test_short_waits_do_not_add_up_to_silence() -> None:
+    log = console(False)
+    lines = ProgressLines(log, every=0.2)
+    start = time.monotonic()
+    while not text(log):
+        with lines.waiting("one of many", 0.1):
+            time.sleep(0.01)
+        assert time.monotonic() - start < 10
+    assert time.monotonic() - start >= 0.2
+    assert text(log).startswith("one of many: 0:00")
 
 
 def test_live_line(timer: Timer) -> None:
@@ -105,33 +139,15 @@ def test_time_left_follows_the_pace_of_the_work(timer: Timer) -> None:
 
 
 def test_long_waits_are_logged(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("keyss.progress._QUIET_SECONDS", 0.05)
-    monkeypatch.setattr("keyss.progress._WAIT_SECONDS", 10.0)
     monkeypatch.setattr("keyss.progress._crowding", lambda: 1.0)
     log = console(False)
-    with ProgressLines(log).waiting("checking a.ply", 100):
-        for _ in range(200):
-            time.sleep(0.02)
-            if text(log):
-                break
-    assert text(log).startswith("checking a.ply: 0:0")
+    with ProgressLines(log, every=0.05).waiting("checking a.ply", 100):
+        wait_for(log, "checking a.ply: 0:0")
     assert " left" in text(log)
     before = text(log)
     with ProgressLines(log).waiting("nothing to do", 100):
-        pass
-    with ProgressLines(log).waiting("reading a.ply", 2):
-        time.sleep(0.2)
+        time.sleep(0.1)
     assert text(log) == before
-
-
-def test_short_waits_together_are_logged(timer: Timer) -> None:
-    log = console(False)
-    lines = ProgressLines(log, timer=timer)
-    for _ in range(4):
-        timer.now += 4
-        with lines.waiting("hiding", 3):
-            time.sleep(0.1)
-    assert len(text(log).splitlines()) == 1
 
 
 def test_only_long_waits_are_displayed_in_terminals(monkeypatch: pytest.MonkeyPatch) -> None:

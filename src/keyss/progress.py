@@ -6,7 +6,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn
@@ -15,8 +15,7 @@ from rich.text import Text
 
 level = 0  # -1: silent, 1: more often; set by the command line
 _DELAY_SECONDS = 1.0  # before a terminal displays a wait
-# In logs: before the first line of a long wait; between lines.
-_QUIET_SECONDS, _WAIT_SECONDS = 2.0, 10.0
+_LOG_SECONDS = 5.0  # after which a silent log gets a line
 _PRIOR = 0.1  # weight of an estimated time in the pace of a wait, relative to all of its work
 
 Share = Callable[[float], None]  # called with the share of the work that is done
@@ -43,7 +42,7 @@ class Reporter:
 
 
 def reporter(console: Console | None = None) -> ProgressLines:
-    """A reporter for `console`, by default the standard error stream."""
+    """A reporter for `console`, by default the standard error stream: that of long functions."""
     console = console or Console(stderr=True, quiet=level < 0)
     return ProgressLines(console, None if level < 1 or console.is_terminal else 1.0)
 
@@ -51,9 +50,8 @@ def reporter(console: Console | None = None) -> ProgressLines:
 class ProgressLines(Reporter):
     """A reporter on a task of rich, which estimates recent speed and remaining time.
 
-    In a terminal, one line is redrawn every 0.25 seconds; elsewhere, for logs, a line is printed every 10
-    seconds. `every` changes this. Lines are redrawn by `update`, not by a thread, which would take cores from
-    training.
+    In a terminal, one line is redrawn every 0.25 seconds; elsewhere, for logs, a line is printed whenever
+    there was none for 5 seconds. `every` changes this.
     """
 
     def __init__(
@@ -64,9 +62,10 @@ class ProgressLines(Reporter):
     ) -> None:
         self.console = console
         self.live = console.is_terminal
-        self.every = (0.25 if self.live else 10.0) if every is None else every
+        self.every = (0.25 if self.live else _LOG_SECONDS) if every is None else every
         self.timer = timer
-        self.noted = timer()
+        self.displayed = timer()
+        self.open = ExitStack()  # the log of a training
         self.task: Task | None = None
 
     def start(self, title: str, iterations: int, iteration: int) -> None:
@@ -88,6 +87,7 @@ class ProgressLines(Reporter):
         if not self.live:
             where = f", continuing at {iteration}" if iteration else ""
             self.note(f"{title}: {iterations} steps{where}")
+            self.open.enter_context(self._logged(self._training))
 
     def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
         task = self.task
@@ -96,19 +96,23 @@ class ProgressLines(Reporter):
         self.progress.update(task.id, completed=iteration)
         count = f"{gaussians:,} Gaussians" if gaussians else ""
         self.numbers = _joined(count, *(f"{name} {value:.2f}" for name, value in numbers.items()))
-        if self.timer() - self.displayed < self.every:
-            return
-        self.displayed = self.timer()
+        if self.live and self.timer() - self.displayed >= self.every:  # a thread would take a core
+            self.displayed = self.timer()
+            self.progress.update(task.id, facts=self._facts(task), refresh=True)
+
+    def _facts(self, task: Task) -> str:
         left = clock(task.time_remaining or 0)
-        facts = _joined(f"{task.speed:.1f} it/s, {left} left" if task.speed else "starting", self.numbers)
-        self.progress.update(task.id, facts=facts, refresh=True)
-        if not self.live:
-            self.note(f"{task.description}: {iteration}/{task.total}, {facts}")
+        return _joined(f"{task.speed:.1f} it/s, {left} left" if task.speed else "starting", self.numbers)
+
+    def _training(self) -> str:
+        task = self.progress.tasks[0]
+        return f"{task.description}: {task.completed}/{task.total}, {self._facts(task)}"
 
     def finish(self) -> None:
         task, self.task = self.task, None
         if task is None:
             return
+        self.open.close()
         duration = f"in {clock(task.elapsed or 0)}"
         self.progress.update(task.id, facts=_joined(duration, self.numbers), refresh=True)
         self.progress.stop()
@@ -117,39 +121,44 @@ class ProgressLines(Reporter):
             self.note(_joined(f"{task.description}: {how} {duration}", self.numbers))
 
     def note(self, line: str) -> None:
-        self.noted = self.timer()
+        self.displayed = self.timer()
         self.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     @contextmanager
     def waiting(self, what: str, seconds: float) -> Iterator[Share]:
-        """See `Reporter`. A terminal displays a moving sign after 1 s.
-
-        Logs get a line 2 s into a long wait, and whenever the last line is 10 s old, also that of an
-        earlier wait.
-        """
+        """See `Reporter`. A terminal displays a moving sign after 1 s."""
         wait = Wait(what, seconds * _crowding(), self.timer)
-        ended = threading.Event()
 
-        def display() -> None:
-            if self.live:
-                if not ended.wait(_DELAY_SECONDS):
-                    with self.console.status(wait, refresh_per_second=4):
-                        ended.wait()
-                return
-            pause = self.noted + _WAIT_SECONDS - self.timer()
-            if wait.seconds > _WAIT_SECONDS:
-                pause = min(pause, _QUIET_SECONDS)
-            while not ended.wait(pause):
-                self.note(str(wait))
-                pause = max(_WAIT_SECONDS, self.every)
+        def display(ended: threading.Event) -> None:
+            if not ended.wait(_DELAY_SECONDS):
+                with self.console.status(wait, refresh_per_second=4):
+                    ended.wait()
 
-        displayed = threading.Thread(target=display, daemon=True)
-        displayed.start()
-        try:
+        with _beside(display) if self.live else self._logged(lambda: str(wait)):
             yield wait.update
-        finally:
-            ended.set()
-            displayed.join()
+
+    def _logged(self, line: Callable[[], str]) -> AbstractContextManager[None]:
+        """While the context is open, print `line` whenever there was none for `every` seconds."""
+
+        def log(ended: threading.Event) -> None:
+            while not ended.wait(max(0, self.displayed + self.every - self.timer())):
+                if self.timer() - self.displayed >= self.every:
+                    self.note(line())
+
+        return _beside(log)
+
+
+@contextmanager
+def _beside(display: Callable[[threading.Event], None]) -> Iterator[None]:
+    """Run `display` in a thread until it gets the event that the context ends."""
+    ended = threading.Event()
+    thread = threading.Thread(target=display, args=(ended,), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 class Wait:

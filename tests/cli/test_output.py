@@ -90,7 +90,7 @@ def test_c_locale(workspace: Path, tmp_path: Path) -> None:
     plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     done = shell("", "fit", workspace / "b", "-o", tmp_path / "ä鍵", *SMALL[2:], **plain)
     assert done.returncode == 0, done.stderr
-    assert b"\nfit b: 20 steps\n" in done.stderr
+    assert b"fit b: 20 steps\n" in done.stderr
     assert os.fsencode(tmp_path / "ä鍵" / "model.ply") in done.stdout  # paths are printed unchanged
     done = shell("", "info", tmp_path / "ä鍵", "--json", **plain)
     assert done.returncode == 0, done.stderr

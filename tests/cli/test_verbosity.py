@@ -10,6 +10,7 @@ import pytest
 from cli.harness import SMALL, Result, Run, scene_arguments
 from keyss import progress
 from keyss.files import write_model
+from keyss.runs import planning
 from tiny_scenes import random_gaussians
 
 
@@ -58,14 +59,19 @@ def test_verbose_prints_duration(keyss: Run, scene: Path, flag: str) -> None:
 
 
 class TestEstimate:
-    WORDS = r"about \d+ s on an idle CPU, \d\.\d GB of memory, up to \d+ MB of disk"
+    """Announced if a run takes more than a minute."""
 
-    def test_fit(self, keyss: Run, scene: Path) -> None:
-        result = fit(keyss, scene)
+    WORDS = r"about \d+ s on the CPU, \d\.\d GB of memory, up to \d+ MB of disk"
+
+    def test_fit(self, keyss: Run, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        assert "about" not in fit(keyss, scene).err
+        monkeypatch.setattr(planning, "_LONG", 0.0)
+        result = fit(keyss, scene, "--overwrite")
         assert re.search(rf"^fit: {self.WORDS}\n.*fit b: 20 steps", result.err, re.DOTALL)
         assert "about" not in fit(keyss, scene, "-q", "--overwrite").err
 
-    def test_hide(self, keyss: Run, workspace: Path, tmp_path: Path) -> None:
+    def test_hide(self, keyss: Run, workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(planning, "_LONG", 0.0)
         hide = ("hide", *scene_arguments(workspace), "--publish", "converted", "-o", tmp_path / "out")
         result = keyss(*hide, *SMALL, "--min-psnr", 0)
         assert result.status == 0, result.err

@@ -13,7 +13,7 @@ from keyss.files.models import is_model_source
 from keyss.fitting.config import FitConfig, preset_for
 from keyss.fitting.image_metrics import quality
 from keyss.fitting.plain import FitResult, fit_scene
-from keyss.progress import Reporter
+from keyss.progress import Reporter, reporter as default_reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import CONFIG, METRICS, MODEL, PathLike, as_scene, path_of
 from keyss.runs.folder import RunFolder
@@ -37,9 +37,10 @@ def fit(
     `config`: by default 1,000 steps and 30,000 Gaussians, on CUDA 30,000 and a million. `views`: how photos
     are read. `out` (a folder) gets `model.ply`, and `private/` with `config.json`, `metrics.json` and
     checkpoints, from which `resume` continues. Without a seed in `config` the run uses a random one, which
-    `config.json` records. Raises KeyssError, and Interrupted on Ctrl-C.
+    `config.json` records. `reporter`: by default progress on the standard error stream;
+    `keyss.progress.Reporter()` is silent. Raises KeyssError, and Interrupted on Ctrl-C.
     """
-    started = time.monotonic()
+    started, reporter = time.monotonic(), reporter or default_reporter()
     if not isinstance(scene, Scene) and is_model_source(scene):
         raise InputError(f"{scene}: expected a folder of posed photos, found a 3DGS model")
     interrupted = Path(out) if resume and out is not None else None
@@ -59,7 +60,7 @@ def fit(
     loaded = as_scene(scene, views)
     cost = cost_of_fit(loaded, config, target)
     check_room(cost, None if out is None else Path(out))
-    if reporter and not resume:
+    if not resume and cost.is_long:
         reporter.note(f"fit: {cost}")
     with folder.work() if folder else nullcontext():
         result = fit_scene(

@@ -38,7 +38,7 @@ from keyss.methods.hidden import HiddenScene
 from keyss.methods.method import Context, Method, MethodOptions, Prepared, Source, Stego, role_of
 from keyss.methods.plain_models import fit_bounds, fit_plain_models
 from keyss.methods.registry import DEFAULT, open_companion, open_model
-from keyss.progress import Reporter
+from keyss.progress import Reporter, reporter as default_reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import from_above
 from keyss.runs.estimates import seconds_to_prepare
@@ -96,6 +96,7 @@ def hide(
 
     `bound`: fit upper bounds to compare with, plain 3DGS with equal Gaussians and training steps; otherwise
     `metrics.json` says which baselines had fewer steps. `dry_run`: check arguments, return only the plan.
+    `reporter`: by default progress on the standard error stream; `keyss.progress.Reporter()` is silent.
 
     At the end, the published file is opened with the keys and compared with the plain models. Raises
     QualityError, publishes nothing and keeps checkpoints if a PSNR is below `min_psnr` (dB; by default 20,
@@ -105,7 +106,7 @@ def hide(
     A list of `SecretFile` hides files in a model, with the default method; `cover_model`, `bound`,
     `min_psnr`, `resume` and `views` are for scenes only.
     """
-    began, target, reporter = time.monotonic(), resolve_device(device), reporter or Reporter()
+    began, target, reporter = time.monotonic(), resolve_device(device), reporter or default_reporter()
     chosen, options = method_for(method, secrets, target.type)
     options = replace(options, publish=publish) if publish else options
     check_arguments(out, min_psnr)
@@ -132,8 +133,9 @@ def hide(
         return HideResult(plan=prepared.plan, cost=cost)
     with folder.work() if folder else nullcontext():
         if not resume and (prepared.grows or trains):
+            size = f"hide: a file of up to {prepared.plan.megabytes:,.1f} MB, {cost}"
             for note in (
-                f"hide: a file of up to {prepared.plan.megabytes:,.1f} MB, {cost}",
+                *([size] if cost.is_long else []),
                 *([prepared.plan.room] if prepared.plan.prunes else []),
                 *prepared.plan.notes,
             ):

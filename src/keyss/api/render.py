@@ -17,7 +17,7 @@ from keyss.files.atomic import check_not_an_input, check_output_file, write_byte
 from keyss.files.images import animation_bytes, png_bytes
 from keyss.measure.hide_quality import WRONG_KEYS, compare, measure_hiding
 from keyss.measure.renders import renders_of
-from keyss.progress import Reporter
+from keyss.progress import Reporter, reporter as default_reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import checked_size, turntable
 from keyss.runs.estimates import seconds_for
@@ -95,7 +95,7 @@ def evaluate(
     only for methods whose keys condition a decoder. Raises WrongKeyError for a key that opens nothing,
     UsageError for a secret without a key.
     """
-    target, reporter = resolve_device(device), reporter or Reporter()
+    target, reporter = resolve_device(device), reporter or default_reporter()
     with reporter.waiting("opening the secrets", len(keys) * seconds_for("reveal", stego_in(Path(run)))):
         opened = open_run(run, keys)
     if wrong_keys is not None and all(secret.decode is None for secret in opened.opened):

@@ -13,7 +13,7 @@ from keyss.files.atomic import public_mode
 from keyss.fitting import FitConfig, mean_psnr
 from keyss.measure.renders import contact_sheet
 from keyss.methods import CarryOptions
-from keyss.progress import Reporter
+from keyss.progress import Reporter, reporter as default_reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import STEGO, plain_names
 from keyss.runs.folder import RunFolder, clear
@@ -54,7 +54,7 @@ def run_demo(
     same seed gives the same `model.ply` and `secret.ply`. Raises KeyssError. On any exception, Ctrl-C
     included, the demo removes everything it wrote.
     """
-    out = Path(out)
+    out, reporter = Path(out), reporter or default_reporter()
     # Replaces all files of an earlier demo, those of other stages included.
     scenes = RunFolder(out, "scenes", {"seed": seed}, overwrite=overwrite)
     try:
@@ -75,7 +75,6 @@ def run_demo(
             out=out,
             reporter=reporter,
         )
-        reporter = reporter or Reporter()
         metrics = keyss.evaluate(out, [key], device=device, reporter=reporter)
         results = RunFolder(out, "demo", onto=("scenes", "hide"))
         with results.work(), reporter.waiting("opening it again, with right and wrong keys", _OPEN_SECONDS):
@@ -108,6 +107,7 @@ def _hide_for_web(out: Path, cover: Scene, secret: Scene, key: str, device: Back
         cover_model=plain_cover,
         min_psnr=0,
         device=device,
+        reporter=Reporter(),
     )
     assert hidden.stego is not None
     return hidden.stego

@@ -28,6 +28,7 @@ _CHECKPOINT = 3  # checkpoint / model: parameters and two moments of Adam
 _MAX_APPENDED = 7  # Gaussians that hold one Gaussian of a secret of SH degree 3
 _COPIES = 1  # copies in memory of the published model and the secrets, beside the given models
 _SHARDS = 7  # copies of appended Gaussians: their shards, coded, placed and read again
+_LONG = 60.0  # seconds; shorter work ends before its cost is read
 _OTHER_BYTES = 2 << 20  # pictures, JSON files, locks
 
 
@@ -45,9 +46,14 @@ class Cost:
     memory_bytes: int
 
     @property
+    def is_long(self) -> bool:
+        """Whether to announce it."""
+        return self.seconds > _LONG
+
+    @property
     def where(self) -> str:
         """The device, for messages."""
-        return "an idle GPU" if self.device == "cuda" else "an idle CPU"
+        return "the GPU" if self.device == "cuda" else "the CPU"
 
     def __str__(self) -> str:
         return (

@@ -24,7 +24,7 @@ from keyss.lab.audits.record import Audit
 from keyss.lab.audits.report import report_of
 from keyss.lab.audits.subject import Subject
 from keyss.methods import registry
-from keyss.progress import Reporter, Share
+from keyss.progress import Reporter, Share, reporter as default_reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs import read_record, write_record
 from keyss.runs.estimates import seconds_for
@@ -74,7 +74,7 @@ def audit(
     _check_extras()
     _, config, *_ = read_run(Path(run))
     parts = _chosen(only, config.method)
-    started, reporter = time.monotonic(), reporter or Reporter()
+    started, reporter = time.monotonic(), reporter or default_reporter()
     with reporter.waiting("opening the secrets", len(keys) * seconds_for("reveal", stego_in(Path(run)))):
         opened = open_run(run, keys)
     subject = Subject(opened, resolve_device(device))

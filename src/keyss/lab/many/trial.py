@@ -143,7 +143,7 @@ def cost_of_trial(trial: Trial, folder: Path, read: Callable[[str, ViewOptions],
         else replace(secret, scene=read(secret.scene, trial.views))
         for secret in arguments["secrets"]
     ]
-    cost = hide(**arguments, dry_run=True).cost
+    cost = hide(**arguments, dry_run=True, reporter=Reporter()).cost
     assert cost is not None  # a dry run always has a cost
     elsewhere = [seconds for seconds, model in zip_longest(cost.fit_seconds, trial.models) if model]
     measures = _seconds_of(trial.measures, cost.view_seconds, trial.options.fit.max_gaussians)

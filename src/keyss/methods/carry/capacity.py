@@ -13,7 +13,8 @@ from keyss.fitting.config import FitConfig
 from keyss.methods.codec.precision import finest_size, prune_to_size, usual_size
 from keyss.rendering.orbit import Viewpoints
 
-_BITS_PER_GAUSSIAN = 150, 210  # usual and finest precision of a secret that is not fitted yet
+# Of a secret that is not fitted yet: usual precision, the same at SH degree 0, finest precision.
+_BITS_PER_GAUSSIAN = 150, 90, 210
 _SAMPLE, _FAR_TOO_LARGE = 10_000, 1.5  # Gaussians of a sample; size / what can be appended
 _TINY = 16  # Gaussians; secrets are not pruned to fewer
 
@@ -24,6 +25,7 @@ class SecretSize:
 
     count: int  # Gaussians
     usual: int  # bytes of its payload with the usual precision
+    flat: int  # the same, at SH degree 0
     finest: int
     sh_degree: int
     fitted: bool
@@ -32,9 +34,10 @@ class SecretSize:
     def of(model: Gaussians | None, fit: FitConfig) -> SecretSize:
         """The size of `model`, or of what `fit` will give."""
         if model is not None:
-            return SecretSize(len(model), usual_size(model), finest_size(model), model.sh_degree, True)
-        usual, finest = (fit.max_gaussians * bits // 8 for bits in _BITS_PER_GAUSSIAN)
-        return SecretSize(fit.max_gaussians, usual, finest, fit.sh_degree, False)
+            sizes = usual_size(model), usual_size(model.with_sh_degree(0)), finest_size(model)
+            return SecretSize(len(model), *sizes, model.sh_degree, True)
+        usual, flat, finest = (fit.max_gaussians * bits // 8 for bits in _BITS_PER_GAUSSIAN)
+        return SecretSize(fit.max_gaussians, usual, flat, finest, fit.sh_degree, False)
 
 
 def check_appended(model: Gaussians) -> None:
@@ -73,14 +76,16 @@ class CarryCapacity:
         prepared = channel.prepare(cover)
         return CarryCapacity(len(cover), cover.sh_degree, channel, prepared.capacity, prepared)
 
-    def sizes(self, secrets: Sequence[SecretSize]) -> list[int]:
-        """The number of Gaussians of each secret that fit at its SH degree; an estimate where not all do.
+    def sizes(self, secrets: Sequence[SecretSize], *, flat: bool = False) -> list[int]:
+        """The number of Gaussians of each secret that fit; an estimate where not all do.
+
+        They keep their SH degree or, if `flat`, have degree 0.
 
         Raises UsageError if the cover is too small.
         """
         limits = self.payloads.limits([secret.finest for secret in secrets])
         counts = [
-            min(secret.count, secret.count * limit // secret.usual)
+            min(secret.count, secret.count * limit // (secret.flat if flat else secret.usual))
             for secret, limit in zip(secrets, limits, strict=True)
         ]
         if any(count < min(_TINY, secret.count) for count, secret in zip(counts, secrets, strict=True)):

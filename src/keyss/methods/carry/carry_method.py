@@ -41,6 +41,7 @@ from keyss.rendering.orbit import Viewpoints
 _MODEL_ITERATIONS, _MODEL_RATE = 400, 0.1
 _SELECTION_VIEWS = 64
 _FINE_TUNED_SHARE = 0.97  # Gaussians fine-tuned / Gaussians that fit: fine-tuning costs compression
+_PLANNED_SHARE = 0.95  # Gaussians planned / estimate: those that are kept take more bytes than others
 # Least shares of a secret's Gaussians. Public models fine-tuned with fewer are below 30 dB; with fewer than
 # the second, and than so many Gaussians, below 20 dB or as far from the plain model as empty renders.
 _MIN_SHARE, _HOPELESS_SHARE, _HOPELESS = 1 / 6, 1 / 100, 500
@@ -133,15 +134,20 @@ class CarryMethod:
             )
         ]
         appended = capacity.appended(secret_sizes)
-        pruned = any(
-            count < size.count and size.sh_degree for size, count in zip(secret_sizes, counts, strict=True)
+        kept, flat = (
+            sum(
+                count if count == size.count else int(_PLANNED_SHARE * count)
+                for size, count in zip(secret_sizes, of, strict=True)
+            )
+            for of in (counts, capacity.sizes(secret_sizes, flat=True))
         )
         plan = Plan(
             gaussians=capacity.gaussians + appended,
             sh_degree=capacity.sh_degree,
             secret_gaussians=sum(secret.count for secret in secret_sizes),
-            capacity=sum(counts),
-            notes=(_note(capacity, appended, pruned=pruned),),
+            capacity=kept,
+            flat_capacity=flat,
+            notes=(_note(capacity, appended),),
         )
         return Prepared(
             options=options,
@@ -208,20 +214,17 @@ def _fine_tuning_steps(
     return steps
 
 
-def _note(capacity: CarryCapacity, appended: int, *, pruned: bool) -> str:
-    """What is appended, or the capacity; `pruned`: of secrets with harmonics that do not fit."""
+def _note(capacity: CarryCapacity, appended: int) -> str:
+    """What is appended, or the capacity."""
     if appended:
         return (
             f"up to {appended:,} invisible Gaussians are appended to the cover's {capacity.gaussians:,}; "
             "fewer Gaussians or a lower SH degree of a secret take less"
         )
-    how, fitted = "exactly", ""
+    held = f"the {capacity.channel.place} have room for"
     if capacity.prepared is None:
-        how, fitted = "about", "; once the cover is fitted, it may be half of that, or a third more"
-    flatter = "; a secret keeps more Gaussians if a lower SH degree shows more of it" * pruned
-    return (
-        f"the {capacity.channel.place} have room for {how} {capacity.payloads.bytes:,} bytes{fitted}{flatter}"
-    )
+        return f"{held} about {capacity.payloads.bytes:,} bytes; fitted, it may be 0.6 to 1.6 times as many"
+    return f"{held} exactly {capacity.payloads.bytes:,} bytes"
 
 
 METHOD = CarryMethod()
