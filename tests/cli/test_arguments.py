@@ -64,7 +64,7 @@ def test_options_override_preset(keyss: Run, hide_calls: list[Any]) -> None:
             "--mask",
             "xyz,sc",
         ),
-        *("--width", 10),
+        *("--width", 20),
         *("--background", 1, 0.5, 0, "--cover-model", "m.ply", "--resume", "--device", "cpu"),
     )
     assert result.status == 0, result.err
@@ -75,7 +75,7 @@ def test_options_override_preset(keyss: Run, hide_calls: list[Any]) -> None:
     assert config.fit.evaluate_every == PRESETS["quick"].evaluate_every
     assert options.pop("reporter") is not None
     assert options == {
-        "views": library.ViewOptions(10, (1.0, 0.5, 0.0)),
+        "views": library.ViewOptions(20, (1.0, 0.5, 0.0)),
         "cover_model": Path("m.ply"),
         "bound": False,
         "min_psnr": None,

@@ -101,6 +101,11 @@ ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
         "leave out --cover-model",
         lambda f: _hide(f, cover=_private_model(f, "cover"), cover_model=_private_model(f, "secret-1")),
     ),
+    "tiny pictures": (
+        2,
+        "--width: expected at least 16 pixels, got 5",
+        lambda f: _hide_models(f, "--width", 5),
+    ),
     "enormous pictures of a model": (2, "width", lambda f: _hide_models(f, "--width", 10**10)),
     "a link to itself": (4, "loop.ply", lambda f: _hide_models(f, secret=_link_loop(f) / "loop.ply")),
     "a model of a secret model": (

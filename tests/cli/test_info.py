@@ -51,6 +51,7 @@ def test_photos_of_several_sizes(keyss: Run, tmp_path: Path) -> None:
     half.save(first)
     out = keyss("info", scene).out
     assert f"{size[0]} x {size[1]}, {size[0] // 2} x {size[1] // 2}" in out
+    assert "farthest camera" in out
 
 
 def test_damaged_photos_are_skipped(keyss: Run, tmp_path: Path) -> None:
@@ -73,7 +74,9 @@ def load_scene_quietly(scene: Path) -> tuple[object, ...]:
 
 def test_capacity(keyss: Run, tmp_path: Path) -> None:
     write_model(tmp_path / "cover.ply", trained_like(1500))
-    assert "--format" not in keyss("info", tmp_path / "cover.ply").out
+    plain = keyss("info", tmp_path / "cover.ply").out
+    assert "--format" not in plain
+    assert all(word in plain for word in ("two corners", "opacities below 0.05", "--capacity", "verify"))
     out = keyss("info", tmp_path / "cover.ply", "--capacity").out
     assert re.search(
         r"--format ply: \d+,\d+ bytes, a model of about \d+,?\d* Gaussians of SH degree 3 or \d+,?\d* ", out

@@ -33,7 +33,10 @@ def test_rows() -> None:
         ["on test photos", "PSNR", "SSIM", "bound", "loss", "Gaussians", "steps"],
         ["cover", "30.00", "0.500", "30.50", "0.50", "1,234", "10"],
         ["secret", "20.00", "0.250", "567", "20"],
-        ["PSNR in dB; bound: PSNR of plain 3DGS with the same steps; loss: bound - PSNR."],
+        [
+            "PSNR in dB; SSIM: 1 if equal; bound: PSNR of plain 3DGS with the same steps; "
+            "loss: bound - PSNR; steps: training steps."
+        ],
     ]
     assert rows[-1] == ["Capacity of the cover: 1,000 Gaussians."]
 
@@ -102,4 +105,4 @@ def test_secrets_that_no_key_shows(highest: float, unlearnt: bool) -> None:
 def test_renders_of_models_are_rounded() -> None:
     """As 8-bit values, a model against itself does not exceed this."""
     renders = table(replace(METRICS, photos=(False, False)))
-    assert renders[3] == ["PSNR in dB. Equal renders, rounded to 8 bits, have 58.92 dB."]
+    assert renders[3] == ["PSNR in dB; SSIM: 1 if equal. Equal renders, rounded to 8 bits, have 58.92 dB."]

@@ -38,11 +38,11 @@ def test_quiet_prints_paths_only(keyss: Run, tmp_path: Path) -> None:
         "key.txt": ("keygen", "-o", tmp_path / "key.txt"),
         "a.spz": ("convert", tmp_path / "a.ply", tmp_path / "a.spz"),
         "page.html": ("view", tmp_path / "a.ply", "-o", tmp_path / "page.html"),
-        "turn.webp": ("render", tmp_path / "a.ply", "-o", tmp_path / "turn.webp", "--width", 8),
+        "turn.webp": ("render", tmp_path / "a.ply", "-o", tmp_path / "turn.webp", "--width", 16),
     }
     for name, command in commands.items():
         assert keyss("-q", *command) == (0, f"{tmp_path / name}\n", "")
-    images = keyss("render", tmp_path / "a.ply", "-o", tmp_path / "images", "--width", 8).out
+    images = keyss("render", tmp_path / "a.ply", "-o", tmp_path / "images", "--width", 16).out
     assert "60 images; private/ lists them for --overwrite" in images
 
 

@@ -13,7 +13,9 @@ from keyss import CarryOptions, demo
 from keyss.core import Interrupted, OutputError
 from keyss.files import load_scene
 from keyss.fitting import FitConfig
+from keyss.lab.audits.audit_run import KEPT
 from keyss.runs import HideMetrics, read_record
+from keyss.runs.folder import RunFolder
 
 SMALL: dict[str, Any] = {
     # So small a model has no room in low bits.
@@ -48,6 +50,11 @@ def test_key_reveals_the_published_files(run: tuple[Path, demo.DemoResult], tmp_
     revealed = keyss.reveal(out / "publish" / "model.ply", "demo-key-3", out=tmp_path / "again.ply").gaussians
     assert (tmp_path / "again.ply").read_bytes() == (out / "secret.ply").read_bytes()
     assert len(keyss.reveal(out / "web.spz", "demo-key-3").gaussians) == len(revealed)
+
+
+def test_audits_keep_the_demo(run: tuple[Path, demo.DemoResult]) -> None:
+    out, _ = run
+    RunFolder(out, "audit", onto=KEPT)  # raises OutputError if it would replace any file
 
 
 def test_existing_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

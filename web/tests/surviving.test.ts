@@ -226,6 +226,6 @@ test('derivations run sequentially, or round robin over several', async () => {
 test('payload packing', () => {
   expect(unpackPayload(hex('66696c6500616263'))).toEqual({ method: 'file', data: hex('616263') });
   for (const damaged of ['', '00', '0066', '66696c65', '80696c6500', '30313233343536373839303132333435' + '00']) {
-    expect(() => unpackPayload(hex(damaged))).toThrow(/damaged\.$/);
+    expect(() => unpackPayload(hex(damaged))).toThrow(/damaged: download or copy it again\.$/);
   }
 });

@@ -48,7 +48,15 @@ PRESETS = (
 )
 PresetName = Literal["quick", "default", "full"]
 Preset = Annotated[PresetName, arg(help=PRESETS)]
-Width = Annotated[int | None, optional("PIXELS", "Downscale wider photos to this width.")]
+MIN_WIDTH = 16  # pixels; smaller pictures show nothing
+Width = Annotated[
+    int | None,
+    optional(
+        "PIXELS",
+        "Downscale wider photos to this width; the width of renders of a model without photos.",
+        "the photos' own, 400 for renders",
+    ),
+]
 Iterations = Annotated[
     int | None, optional("N", "Training steps of each model, and of fine-tuning.", "the preset's")
 ]
@@ -80,6 +88,8 @@ class Photos:
         """As an argument of the public functions."""
         from keyss.core import ViewOptions
 
+        if self.width is not None and self.width < MIN_WIDTH:
+            raise UsageError(f"--width: expected at least {MIN_WIDTH} pixels, got {self.width}")
         return ViewOptions(**vars(self))
 
 

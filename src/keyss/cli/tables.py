@@ -32,14 +32,20 @@ if TYPE_CHECKING:
 # Columns of the table of a hiding, with what its legend says of them.
 _HEADS = {
     "PSNR": "PSNR in dB",
-    "SSIM": "",
+    "SSIM": "SSIM: 1 if equal",
     "LPIPS": "LPIPS (AlexNet): lower is better",
     "bound": "bound: PSNR of plain 3DGS with the same steps",
     "loss": "loss: bound - PSNR",
     "start": "start: PSNR of a plain model with fewer steps, no bound (`keyss hide --bound` fits one)",
     "Gaussians": "",
     "plain": "plain: Gaussians of the plain model",
-    "steps": "",
+    "steps": "steps: training steps",
+}
+# What `info` says of a number.
+_MEANINGS = {
+    "bounding_box": "{}: two corners, in the model's units",
+    "nearly_transparent": "{} of the Gaussians, those with opacities below 0.05",
+    "extent": "{}: distance of the farthest camera from their middle plus a tenth, in the scene's units",
 }
 _ROUNDED = 20 * math.log10(255 * math.sqrt(12))  # PSNR of the error of rounding to 8 bits
 _SHOWS = 1.0  # dB below the secret at which a wrong key shows as much
@@ -115,7 +121,7 @@ def print_plan(method: str, plan: Plan, cost: Cost) -> None:
     """Print capacity and estimates of a run."""
     of = [f"{role_of(index, len(cost.steps))} {steps:,}" for index, steps in enumerate(cost.steps)]
     training = [("training", f"steps: {', '.join(of)}")] if any(cost.steps) else []
-    _print_columns(
+    print_columns(
         [
             ("method", method),
             ("capacity", plan.room),
@@ -185,8 +191,13 @@ def print_info(described: RunInfo | InterruptedRun | ModelInfo | SceneInfo) -> N
     if not isinstance(described, RunInfo):
         facts = {name: value for name, value in vars(described).items() if value is not None}
         capacity = facts.pop("capacity", ())
-        rows = [(name.replace("_", " "), _text(value)) for name, value in facts.items()]
-        _print_columns([*rows, *(("capacity", line) for line in capacity)])
+        rows = [
+            (name.replace("_", " "), _MEANINGS.get(name, "{}").format(_text(value)))
+            for name, value in facts.items()
+        ]
+        print_columns([*rows, *(("capacity", line) for line in capacity)])
+        if "bounding_box" in facts:
+            print("`keyss info --capacity` says what it can hide, and `keyss verify` checks it.")
         return
     from keyss.runs.run_records import HideMetrics
 
@@ -210,7 +221,7 @@ def print_verification(checked: Verification) -> None:
         what = f"{secret.found:,}{of} {secret.unit}: {'; '.join(secret.problems) or 'complete'}"
         rows.append(("secret" if len(checked.secrets) == 1 else f"secret of key {number}", what))
     about_model = f"{model.gaussians:,} Gaussians of SH degree {model.sh_degree}: {problems}"
-    _print_columns([("model", about_model), *(rows or [("secret", "not checked, as no key was given")])])
+    print_columns([("model", about_model), *(rows or [("secret", "not checked, as no key was given")])])
 
 
 def print_conversion(out: Path, conversion: Conversion, *, dry_run: bool) -> None:
@@ -227,8 +238,6 @@ def print_conversion(out: Path, conversion: Conversion, *, dry_run: bool) -> Non
         f"{out}: {len(conversion.gaussians):,} Gaussians, {_size(conversion.bytes_after)}{was}, {renders}",
         file=file,
     )
-    if out.name.lower().endswith(".spz"):
-        print("y is up in an .spz: programs that do not turn it show it upside down", file=file)
     for number, secret in enumerate(conversion.secrets, 1):
         which = "the secret" if len(conversion.secrets) == 1 else f"the secret of key {number}"
         state = "survives" if secret.kept else f"is lost: {secret.after:,} {secret.unit} are left"
@@ -255,7 +264,7 @@ def print_files(folder: Path, names: Mapping[str, str]) -> None:
     if progress.level < 0:
         print(*(path for path, _ in results), sep="\n")
     else:
-        _print_columns(results)
+        print_columns(results)
 
 
 def print_written(path: Path, text: str) -> None:
@@ -266,22 +275,22 @@ def print_written(path: Path, text: str) -> None:
     )
 
 
-def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
+def print_columns(rows: Sequence[tuple[str, str]]) -> None:
     """Print two columns of plain text. Paths are never wrapped."""
     width = max((len(name) for name, _ in rows), default=0)
     for name, text in rows:
         print(f"{name:<{width}}  {text}")
 
 
-def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], *, texts: int = 1) -> None:
-    """Print a table; its first `texts` columns are aligned left, the others hold numbers.
+def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a table; its first column is aligned left, the others hold numbers.
 
     Cells wrap between words. If the terminal is too narrow, each row becomes a list.
     """
     console, rows = Console(), list(rows)
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
     for index, head in enumerate(heads):
-        table.add_column(head, justify="left" if index < texts else "right", overflow="fold")
+        table.add_column(head, justify="right" if index else "left", overflow="fold")
     for row in rows:
         table.add_row(*map(Text, row))
     unlimited = console.options.update(max_width=10**6)

@@ -116,6 +116,11 @@ def not_whole(kind: str, found: str) -> InputError:
     return InputError(f"not a whole {kind}: {found}; download or copy it again")
 
 
+def damaged(kind: str, found: str) -> InputError:
+    """The error of a file whose content contradicts its format."""
+    return InputError(f"damaged {kind}: {found}; download or export it again")
+
+
 def nearest(word: str, known: Collection[str]) -> str | None:
     """The most similar of the `known` names, None if none is similar."""
     matches = get_close_matches(word[:MAX_LENGTH], sorted(known), n=1, cutoff=0.7)

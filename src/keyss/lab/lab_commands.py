@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -64,7 +63,7 @@ def audit(
     measure = verb("audit")
     from keyss import progress
     from keyss.cli.keys import keys_of_run
-    from keyss.cli.tables import Console, print_files, print_table
+    from keyss.cli.tables import Console, print_columns, print_files, print_table
 
     if dry_run:
         from keyss.lab.audits.audit_run import forecast_audit
@@ -95,8 +94,12 @@ def audit(
     if progress.level >= 0:
         for table in result.unjudged:
             print_table(table.heads, table.rows)
-        if rows := [astuple(verdict) for verdict in result.verdicts]:
-            print_table(("measure", "measured", "baseline or control", "limit", "verdict"), rows, texts=5)
+        print_columns(
+            [
+                (each.word, f"{each.measure}: {each.value}; {each.beside}; limit: {each.limit}")
+                for each in result.verdicts
+            ]
+        )
         Console().print(headline(result.verdicts), highlight=False)
     print_files(
         run,

@@ -4,7 +4,7 @@ export class InputError extends Error {
 }
 
 export function damaged(): InputError {
-  return new InputError('This file is damaged.');
+  return new InputError('This file is damaged: download or copy it again.');
 }
 
 export function otherVersion(): InputError {

@@ -174,7 +174,7 @@ function notFinite(): InputError {
 }
 
 function notWhole(): InputError {
-  return new InputError('This is not a whole .ply file.');
+  return new InputError('This is not a whole .ply file: download or copy it again.');
 }
 
 function noModel(): InputError {

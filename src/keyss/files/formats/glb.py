@@ -23,7 +23,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from keyss.core.arrays import Doubles, Numbers
-from keyss.core.errors import InputError, not_whole
+from keyss.core.errors import InputError, damaged, not_whole
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
 from keyss.files.file_kinds import FIT
@@ -126,7 +126,7 @@ def read(data: bytes) -> Gaussians:
     count = sum(len(attributes) for _, attributes in parts)
     degree = max(attributes.sh_degree for _, attributes in parts)
     if count * (11 + 3 * (degree + 1) ** 2) > _VALUES_PER_BYTE * len(data):
-        raise InputError("damaged glTF: the same Gaussians over and over")
+        raise damaged("glTF", "the same Gaussians over and over")
     blocks = (
         move(attributes.gaussians(part)).with_sh_degree(degree)
         for to_scene, attributes in parts
@@ -241,7 +241,7 @@ def _instances(document: _Document) -> Iterator[tuple[Doubles, _Primitive]]:
         while stack:
             index, above = stack.pop()
             if index in visited or len(above) > _MAX_DEPTH or index < 0:
-                raise InputError("damaged glTF: its nodes are not a tree")
+                raise damaged("glTF", "its nodes are not a tree")
             visited.add(index)
             node = document.nodes[index]
             path = (*above, node)
@@ -256,7 +256,7 @@ def _instances(document: _Document) -> Iterator[tuple[Doubles, _Primitive]]:
                 to_scene = reduce(np.matmul, map(_transform, path))
                 yield from ((to_scene, primitive) for primitive in primitives)
     except (IndexError, TypeError) as error:
-        raise InputError("damaged glTF: it refers to a missing part") from error
+        raise damaged("glTF", "it refers to a missing part") from error
 
 
 def _transform(node: _Node) -> Doubles:
@@ -270,9 +270,9 @@ def _transform(node: _Node) -> Doubles:
             transform[:3, :3] = rotation * np.array(node.scale or [1, 1, 1], np.float64).reshape(3)
             transform[:3, 3] = node.translation or [0, 0, 0]
     except ValueError as error:
-        raise InputError("damaged glTF: a node has no proper transform") from error
+        raise damaged("glTF", "a node has no proper transform") from error
     if not np.isfinite(transform).all():
-        raise InputError("damaged glTF: a node's transform is not finite")
+        raise damaged("glTF", "a node's transform is not finite")
     return transform
 
 
@@ -315,7 +315,7 @@ class _Attributes:
         """Some of the Gaussians. Raises InputError for opacities out of range."""
         alphas, sh = self.alphas[part][:, 0], [band[part] for band in self.sh]
         if ((alphas < 0) | (alphas > 1)).any():
-            raise InputError("damaged glTF: opacities outside of 0 to 1")
+            raise damaged("glTF", "opacities outside of 0 to 1")
         quats = unit(np.roll(self.quats[part], 1, axis=1))
         rest = np.stack(sh[1:], axis=1) if len(sh) > 1 else np.empty((len(alphas), 0, 3))
         return gaussians_of(self.means[part], quats, log_scales_of(self.scales[part]), alphas, sh[0], rest)
@@ -328,7 +328,7 @@ def _attributes(document: _Document, primitive: _Primitive, binary: memoryview) 
 
     def attribute(name: str, width: int) -> _Values:
         if name not in primitive.attributes:
-            raise InputError(f"damaged glTF: its Gaussians have no {name}")
+            raise damaged("glTF", f"its Gaussians have no {name}")
         return _values(document, primitive.attributes[name], width, binary)
 
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in primitive.attributes)
@@ -341,20 +341,20 @@ def _attributes(document: _Document, primitive: _Primitive, binary: memoryview) 
     )
     others = (attributes.quats, attributes.scales, attributes.alphas, *attributes.sh)
     if not len(attributes) or any(len(column) != len(attributes) for column in others):
-        raise InputError("damaged glTF: no Gaussians, or attributes of different lengths")
+        raise damaged("glTF", "no Gaussians, or attributes of different lengths")
     return attributes
 
 
 def _values(document: _Document, index: int, width: int, binary: memoryview) -> _Values:
     """The values [N, width] of an accessor into the binary chunk."""
     if not 0 <= index < len(document.accessors):
-        raise InputError("damaged glTF: it refers to a missing accessor")
+        raise damaged("glTF", "it refers to a missing accessor")
     accessor = document.accessors[index]
     code = _COMPONENTS.get(accessor.componentType)
     if accessor.sparse is not None or code is None or _WIDTHS.get(accessor.type) != width:
-        raise InputError(f"damaged glTF: expected an accessor of {width} numbers each")
+        raise damaged("glTF", f"expected an accessor of {width} numbers each")
     if accessor.bufferView is None or not 0 <= accessor.bufferView < len(document.bufferViews):
-        raise InputError("damaged glTF: it refers to a missing buffer view")
+        raise damaged("glTF", "it refers to a missing buffer view")
     view = document.bufferViews[accessor.bufferView]
     if view.buffer != 0 or any("uri" in buffer for buffer in document.buffers[:1]):
         raise InputError("expected a .glb that contains its data, found one that refers to other files")
@@ -365,7 +365,7 @@ def _values(document: _Document, index: int, width: int, binary: memoryview) -> 
     needed = (accessor.count - 1) * stride + row
     is_sound = min(accessor.count, view.byteOffset, accessor.byteOffset) >= 0 and stride >= row
     if not is_sound or (accessor.count and start + needed > min(end, len(binary))):
-        raise InputError("damaged glTF: an accessor exceeds its buffer view")
+        raise damaged("glTF", "an accessor exceeds its buffer view")
     shape, strides = (accessor.count, width), (stride, dtype.itemsize)
     stored = np.ndarray(shape, dtype, binary, start, strides) if accessor.count else np.empty(shape)
     return _Values(stored, accessor.normalized)

@@ -23,7 +23,7 @@ import numpy as np
 from PIL import Image
 
 from keyss.core.arrays import Bytes, Doubles, Floats, Numbers, Shorts
-from keyss.core.errors import InputError, not_whole
+from keyss.core.errors import InputError, damaged, not_whole
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.codebooks import SIZE, codebook_of, nearest, palette_of
 from keyss.files.formats.common import (
@@ -118,7 +118,7 @@ class SogCodes(Codes):
         low, high = image(meta.means.files), image(meta.means.files, 1)
         quats, colors = image(meta.quats.files), image(meta.sh0.files)
         if (quats[:, 3] < _LARGEST).any():
-            raise InputError("damaged SOG: expected 252 to 255 in the fourth channel of its quaternions")
+            raise damaged("SOG", "expected 252 to 255 in the fourth channel of its quaternions")
         sh_codebook, palette, labels = _no_harmonics(n)
         if meta.shN is not None and meta.shN.bands:
             k = check_sh_degree(meta.shN.bands)
@@ -126,7 +126,7 @@ class SogCodes(Codes):
             pair = image(meta.shN.files, 1)
             labels = _uint16(pair[:, 0], pair[:, 1])
             if not int(labels.max()) < meta.shN.count <= _MAX_LABELS:
-                raise InputError("damaged SOG: labels beyond the end of its palette")
+                raise damaged("SOG", "labels beyond the end of its palette")
             size = -(-meta.shN.count // _ROW) * _ROW
             rows = _decode_webp(file(meta.shN.files[0]), size * k, width=_ROW * k)
             palette = rows[: meta.shN.count * k, :3].reshape(-1, k, 3).copy()
@@ -241,11 +241,11 @@ def _no_harmonics(count: int) -> tuple[Floats, Bytes, Shorts]:
 def _codebook(values: list[float]) -> Floats:
     """[256] finite numbers, padded with 0. Raises InputError."""
     if not 1 <= len(values) <= SIZE:
-        raise InputError(f"damaged SOG: expected codebooks of 1 to {SIZE} numbers, found {len(values):,}")
+        raise damaged("SOG", f"expected codebooks of 1 to {SIZE} numbers, found {len(values):,}")
     with np.errstate(over="ignore"):
         numbers = np.pad(np.array(values, np.float64), (0, SIZE - len(values))).astype(np.float32)
     if not np.isfinite(numbers).all():
-        raise InputError("damaged SOG: a codebook is not finite")
+        raise damaged("SOG", "a codebook is not finite")
     return numbers
 
 
@@ -312,16 +312,16 @@ def _open_archive(data: bytes) -> Callable[[str], bytes]:
     if len(members) > _MAX_MEMBERS:
         raise InputError(f"expected a SOG of at most {_MAX_MEMBERS} files, found {len(members):,}")
     if len({info.header_offset for info in members}) < len(members):
-        raise InputError("damaged SOG: two of its files are at the same place")
+        raise damaged("SOG", "two of its files are at the same place")
     unpacked = sum(info.file_size for info in members)
     if unpacked > 2 * len(data) + _MAX_META_BYTES:
-        raise InputError(f"damaged SOG: {len(data):,} bytes that unpack to {unpacked:,}")
+        raise damaged("SOG", f"{len(data):,} bytes that unpack to {unpacked:,}")
 
     def read(name: str) -> bytes:
         try:
             info = archive.getinfo(name)
             if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise InputError(f"damaged SOG: {name[:80]!r} has an unsupported ZIP compression")
+                raise damaged("SOG", f"{name[:80]!r} has an unsupported ZIP compression")
             with archive.open(info) as file:
                 return file.read(info.file_size)
         except KeyError as error:
@@ -329,7 +329,7 @@ def _open_archive(data: bytes) -> Callable[[str], bytes]:
                 f"not a SOG: there is no {name[:80]!r} in the archive; unpack it if it is another"
             ) from error
         except _BROKEN as error:
-            raise InputError(f"damaged SOG: {name[:80]!r}: {reason(error)}") from error
+            raise damaged("SOG", f"{name[:80]!r}: {reason(error)}") from error
 
     return read
 
@@ -351,18 +351,18 @@ def _decode_webp(data: bytes, count: int, width: int | None = None) -> Bytes:
     size = _webp_size(data)
     area = size[0] * size[1]
     if area < count or (width is not None and size[0] != width):
-        raise InputError(f"damaged SOG: expected an image of {count:,} pixels, found {size[0]} x {size[1]}")
+        raise damaged("SOG", f"expected an image of {count:,} pixels, found {size[0]} x {size[1]}")
     if area > max(_SMALL_IMAGE, 4 * count):
-        raise InputError(f"damaged SOG: an image of {size[0]} x {size[1]} for {count:,} pixels")
+        raise damaged("SOG", f"an image of {size[0]} x {size[1]} for {count:,} pixels")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(io.BytesIO(data), formats=("WEBP",)) as image:
                 if image.size != size:
-                    raise InputError("damaged SOG: an image with two sizes")
+                    raise damaged("SOG", "an image with two sizes")
                 decoded = np.asarray(image.convert("RGBA")).reshape(-1, 4)
     except (OSError, ValueError, SyntaxError, EOFError, MemoryError, Image.DecompressionBombError) as error:
-        raise InputError(f"damaged SOG: an image cannot be read: {reason(error)}") from error
+        raise damaged("SOG", f"an image cannot be read: {reason(error)}") from error
     return decoded[:count]
 
 
@@ -382,10 +382,10 @@ def _webp_size(data: bytes) -> tuple[int, int]:
     https://developers.google.com/speed/webp/docs/riff_container
     """
     if len(data) < 30 or data[:4] != b"RIFF" or data[8:12] != b"WEBP":
-        raise InputError("damaged SOG: an image is not WebP")
+        raise damaged("SOG", "an image is not WebP")
     if data[12:16] == b"VP8L":
         (bits,) = struct.unpack_from("<I", data, 21)
         return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
     if data[12:16] == b"VP8X" and b"VP8L" in data[30:]:
         return int.from_bytes(data[24:27], "little") + 1, int.from_bytes(data[27:30], "little") + 1
-    raise InputError("damaged SOG: expected lossless WebP images, found others")
+    raise damaged("SOG", "expected lossless WebP images, found others")

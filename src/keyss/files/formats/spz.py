@@ -21,7 +21,7 @@ import numpy.typing as npt
 import zstandard
 
 from keyss.core.arrays import Bytes, Floats, Shorts
-from keyss.core.errors import InputError, KeyssWarning, OutputError, not_whole
+from keyss.core.errors import InputError, KeyssWarning, OutputError, damaged, not_whole
 from keyss.core.gaussians import Gaussians
 from keyss.files.formats.common import (
     MIN_BYTES,
@@ -145,7 +145,7 @@ def _unpack_gzip(data: bytes) -> tuple[_Header, bytes, bytes]:
         if not stream.eof:  # zlib checks the trailing checksum in a further call
             body += stream.decompress(stream.unconsumed_tail, 1)
     except zlib.error as error:
-        raise InputError(f"damaged SPZ: {reason(error)}") from error
+        raise damaged("SPZ", f"{reason(error)}") from error
     if len(body) < size or not stream.eof:
         amount = "fewer" if len(body) < size or not stream.unconsumed_tail else "more"
         raise not_whole("SPZ", f"expected {size:,} bytes of {header.gaussians:,} Gaussians, found {amount}")
@@ -159,7 +159,7 @@ def _unpack_zstd(data: bytes) -> tuple[_Header, bytes, bytes]:
         raise InputError(f"expected version 4 of SPZ after NGSP, found version {header.version}")
     sizes = [size for size in header.sizes if size]
     if header.streams != len(sizes):
-        raise InputError(f"damaged SPZ: expected {len(sizes)} streams, found {header.streams}")
+        raise damaged("SPZ", f"expected {len(sizes)} streams, found {header.streams}")
     at = int.from_bytes(data[_START.size : _START.size + 4], "little")
     start = at + len(sizes) * _ENTRY.size
     if at < _START.size + _PLACE.size or start > len(data):
@@ -180,7 +180,7 @@ def _zstd(packed: bytes, size: int) -> bytes:
         with unpacker.stream_reader(packed) as reader:
             body = reader.read(size)
     except zstandard.ZstdError as error:
-        raise InputError(f"damaged SPZ: {reason(error)}") from error
+        raise damaged("SPZ", f"{reason(error)}") from error
     if len(body) != size:
         raise not_whole("SPZ", f"expected a stream of {size:,} bytes, found {len(body):,}")
     return body

@@ -35,7 +35,7 @@ from keyss.runs.planning import cost_of_fit, view_seconds
 
 AUDIT, PICTURES = f"{PRIVATE}/audit/audit.json", f"{PRIVATE}/audit/pictures"  # relative to the run
 EXTRA = ("ot", "sklearn")
-KEPT = ("hide", "demo", "controls")  # stages of a run whose files an audit keeps
+KEPT = ("scenes", "hide", "demo", "controls")  # stages of a run whose files an audit keeps
 
 
 def read_audit(run: Path) -> Audit:

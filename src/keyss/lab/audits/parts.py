@@ -377,7 +377,7 @@ PARTS = {
         "3D-Sinkhorn is for comparison with the paper and gets no verdict: it does not change if scales "
         "are doubled or colours swapped.",
         parameters,
-        Work(seconds=10.0, per_gaussian=2e-3),
+        Work(seconds=3.0, per_gaussian=2e-3),
     ),
     "stealth": Part(
         "The file by itself",
@@ -407,7 +407,7 @@ PARTS = {
         "Robustness",
         "PSNR on test views after a change of the published model; in brackets, the change.",
         robustness,
-        Work(seconds=100.0, views=1000),
+        Work(seconds=20.0, views=1000),
     ),
     "speed": Part("Speed", "Both models are rendered in turn.", speed, Work(views=32), only_3dgs=False),
 }
