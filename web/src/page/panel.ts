@@ -17,7 +17,7 @@ export const page = {
   ...all<HTMLImageElement>()('poster'),
 };
 
-const SMALL = '(max-width: 600px), (max-height: 500px)'; // the panel would cover the scene, or be cut
+const SMALL = '(max-width: 600px), (max-height: 500px) and (pointer: coarse)'; // the panel would cover the scene, or be cut
 
 /** `opened` receives chosen and dropped files. */
 export function preparePanel(opened: (file: File) => void): void {
