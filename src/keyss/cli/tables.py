@@ -196,7 +196,7 @@ def print_info(described: RunInfo | InterruptedRun | ModelInfo | SceneInfo) -> N
             for name, value in facts.items()
         ]
         print_columns([*rows, *(("capacity", line) for line in capacity)])
-        if "bounding_box" in facts:
+        if "bounding_box" in facts and not capacity:
             print("`keyss info --capacity` says what it can hide, and `keyss verify` checks it.")
         return
     from keyss.runs.run_records import HideMetrics
