@@ -15,7 +15,10 @@ from typing import BinaryIO
 
 from keyss.core.errors import OutputError, UsageError
 
-LEFTOVERS = "lock", "unfinished"  # ends of the names of what a killed write leaves beside its file
+
+def leftovers(path: Path) -> tuple[Path, Path]:
+    """The lock and the temporary file of a write to `path`, which a killed process leaves behind."""
+    return path.with_name(f".{path.name}.lock"), path.with_name(f".{path.name}.unfinished")
 
 
 @contextmanager
@@ -28,9 +31,9 @@ def atomic_write(path: Path | str, mode: int = 0o600) -> Iterator[BinaryIO]:
     the same file.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.unfinished")
+    locked, temporary = leftovers(path)
     try:
-        with lock(path.with_name(f".{path.name}.lock"), path):
+        with lock(locked, path):
             temporary.unlink(missing_ok=True)
             try:
                 with open(temporary, "xb", opener=partial(os.open, mode=0o600)) as file:

@@ -22,7 +22,7 @@ import msgspec
 from keyss._version import __version__
 from keyss.core.errors import InputError, KeyssWarning, OutputError, UsageError
 from keyss.core.gaussians import Gaussians
-from keyss.files.atomic import LEFTOVERS, check_not_an_input, lock, public_mode, write_bytes
+from keyss.files.atomic import check_not_an_input, leftovers, lock, public_mode, write_bytes
 from keyss.files.models import write_model
 from keyss.runs.json_records import read_record, record_bytes, write_record
 
@@ -135,8 +135,7 @@ class RunFolder:
 
     def _has_files(self) -> bool:
         """True if the folder has a file; a killed process may leave folders, locks and a partial manifest."""
-        manifest = self.path / MANIFEST
-        left = {self.path / _LOCK, *(manifest.with_name(f".{manifest.name}.{end}") for end in LEFTOVERS)}
+        left = {self.path / _LOCK, *leftovers(self.path / MANIFEST)}
         paths = self.path.rglob("*")
         return any(path not in left and not (path.is_dir() and not path.is_symlink()) for path in paths)
 

@@ -13,8 +13,8 @@ from keyss.fitting.config import FitConfig
 from keyss.methods.codec.precision import finest_size, prune_to_size, usual_size
 from keyss.rendering.orbit import Viewpoints
 
-# Of a secret that is not fitted yet: usual precision, the same at SH degree 0, finest precision.
-_BITS_PER_GAUSSIAN = 150, 90, 210
+_BITS_PER_GAUSSIAN = 150, 210  # of a secret that is not fitted yet, with the usual and the finest precision
+_FLAT_BITS = 90  # bits of an unfitted Gaussian of SH degree 0, with the usual precision
 _SAMPLE, _FAR_TOO_LARGE = 10_000, 1.5  # Gaussians of a sample; size / what can be appended
 _TINY = 16  # Gaussians; secrets are not pruned to fewer
 
@@ -25,19 +25,28 @@ class SecretSize:
 
     count: int  # Gaussians
     usual: int  # bytes of its payload with the usual precision
-    flat: int  # the same, at SH degree 0
     finest: int
     sh_degree: int
-    fitted: bool
+    model: Gaussians | None  # None: not fitted yet
 
     @staticmethod
     def of(model: Gaussians | None, fit: FitConfig) -> SecretSize:
         """The size of `model`, or of what `fit` will give."""
         if model is not None:
-            sizes = usual_size(model), usual_size(model.with_sh_degree(0)), finest_size(model)
-            return SecretSize(len(model), *sizes, model.sh_degree, True)
-        usual, flat, finest = (fit.max_gaussians * bits // 8 for bits in _BITS_PER_GAUSSIAN)
-        return SecretSize(fit.max_gaussians, usual, flat, finest, fit.sh_degree, False)
+            return SecretSize(len(model), usual_size(model), finest_size(model), model.sh_degree, model)
+        usual, finest = (fit.max_gaussians * bits // 8 for bits in _BITS_PER_GAUSSIAN)
+        return SecretSize(fit.max_gaussians, usual, finest, fit.sh_degree, None)
+
+    @property
+    def fitted(self) -> bool:
+        return self.model is not None
+
+    @property
+    def flat(self) -> int:
+        """Like `usual`, at SH degree 0; takes as long again for large models."""
+        if self.model is None:
+            return self.count * _FLAT_BITS // 8
+        return usual_size(self.model.with_sh_degree(0))
 
 
 def check_appended(model: Gaussians) -> None:

@@ -134,12 +134,13 @@ class CarryMethod:
             )
         ]
         appended = capacity.appended(secret_sizes)
+        prunes = any(count < size.count for count, size in zip(counts, secret_sizes, strict=True))
         kept, flat = (
             sum(
                 count if count == size.count else int(_PLANNED_SHARE * count)
                 for size, count in zip(secret_sizes, of, strict=True)
             )
-            for of in (counts, capacity.sizes(secret_sizes, flat=True))
+            for of in (counts, capacity.sizes(secret_sizes, flat=True) if prunes else counts)
         )
         plan = Plan(
             gaussians=capacity.gaussians + appended,
