@@ -30,11 +30,7 @@ from .keyss.keyss_options import (
     KeyssOptions as KeyssOptions,
     parse_mask as parse_mask,
 )
-from .keyss.training import (
-    CombinedPoses as CombinedPoses,
-    KeyssTraining as KeyssTraining,
-    PlacedScene as PlacedScene,
-)
+from .keyss.training import CombinedPoses as CombinedPoses, KeyssTraining as KeyssTraining
 from .method import (
     Capabilities as Capabilities,
     CommandLineOption as CommandLineOption,
@@ -46,5 +42,6 @@ from .method import (
     Stego as Stego,
     Training as Training,
 )
+from .placed_scene import PlacedScene as PlacedScene
 from .plain_models import fit_plain_models as fit_plain_models
 from .registry import open_model as open_model

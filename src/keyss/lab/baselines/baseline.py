@@ -18,8 +18,9 @@ from keyss.core.similarity import Similarity
 from keyss.fitting.adam import RowAdam
 from keyss.lab.baselines.baseline_options import BaselineOptions
 from keyss.methods.hidden import Frame, HiddenScene
-from keyss.methods.keyss.training import KeyssTraining, Picture, PlacedScene
+from keyss.methods.keyss.training import KeyssTraining, Picture
 from keyss.methods.method import Capabilities, Context, Prepared, Source, Stego
+from keyss.methods.placed_scene import PlacedScene
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
 FORMAT, VERSION = "keyss-baseline", 1

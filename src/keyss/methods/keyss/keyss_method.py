@@ -34,8 +34,9 @@ from keyss.keys.derivation import SALT_BYTES, expand, stream
 from keyss.methods.hidden import Frame, HiddenScene, Recovered
 from keyss.methods.keyss.decoder import Decoder
 from keyss.methods.keyss.keyss_options import DecoderShape, KeyssOptions, parse_mask
-from keyss.methods.keyss.training import KeyssTraining, PlacedScene
+from keyss.methods.keyss.training import KeyssTraining
 from keyss.methods.method import Capabilities, Context, Prepared, Source, Stego
+from keyss.methods.placed_scene import PlacedScene
 from keyss.methods.tensors import Header, pack_tensors, refuse_damage, unpack_tensors
 
 NAME = "keyss"

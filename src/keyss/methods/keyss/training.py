@@ -18,7 +18,6 @@ from torch import Tensor
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera, Scene
-from keyss.core.similarity import Similarity, align
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, CombinedStrategy, Rendered
 from keyss.fitting.image_metrics import psnr, subsample_views
@@ -36,6 +35,7 @@ from keyss.keys.derivation import random_embeddings
 from keyss.methods.keyss.decoder import Decoder
 from keyss.methods.keyss.keyss_options import JointOptions, Scenes
 from keyss.methods.method import Context, Source, divide, role_of
+from keyss.methods.placed_scene import PlacedScene
 from keyss.rendering import render, render_with_meta
 
 CACHE_BYTES = 2 << 30
@@ -46,34 +46,6 @@ Pose = tuple[int, int]  # a scene and the index of its training view
 def scene_indices(which: Scenes, count: int) -> list[int]:
     """Indices of the scenes in `which`: 0 is the cover, then the secrets."""
     return {"both": list(range(count)), "cover": [0], "secret": list(range(1, count))}[which]
-
-
-@dataclass(frozen=True)
-class PlacedScene:
-    """A scene and its plain model, both moved into the cover's frame."""
-
-    scene: Scene
-    plain: Gaussians
-    frame: Similarity  # own frame to cover frame
-
-    @staticmethod
-    def of(scene: Scene, plain: Gaussians, frame: Similarity) -> PlacedScene:
-        """Move a scene and its plain model, both in the scene's own frame, by `frame`."""
-        train, test = (
-            tuple(replace(view, camera=frame.apply_camera(view.camera)) for view in views)
-            for views in (scene.train, scene.test)
-        )
-        placed = replace(scene, train=train, test=test, points=frame.apply_points(scene.points))
-        return PlacedScene(placed, frame.apply_gaussians(plain), frame)
-
-    @staticmethod
-    def all_of(sources: Sequence[Source]) -> list[PlacedScene]:
-        """The cover, then the secrets, aligned with it by their cameras (ours; see `align`)."""
-        cameras = [[view.camera for view in source.scene.train] for source in sources]
-        frames = [Similarity(), *(align(camera, cameras[0]) for camera in cameras[1:])]
-        return [
-            PlacedScene.of(source.scene, source.model, at) for source, at in zip(sources, frames, strict=True)
-        ]
 
 
 @dataclass(frozen=True)
