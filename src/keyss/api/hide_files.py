@@ -13,7 +13,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.formats.ply import with_extras
 from keyss.files.inputs import as_text, read_file
-from keyss.files.models import read_model
+from keyss.files.models import read_model, reads_as
 from keyss.keys.encryption import MAX_PAYLOAD_BYTES, compressed_size
 from keyss.methods.hidden import HiddenFile
 from keyss.methods.method import MethodOptions
@@ -56,7 +56,8 @@ def hide_files(
             published = stego
             if folder:
                 name = stego_name(stego)
-                published = read_model(folder.write({name: with_extras(stego, cover, model)}) / name)
+                path = folder.write({name: with_extras(stego, cover, model)}) / name
+                published = stego if reads_as(path, stego) else read_model(path)
             if [HiddenFile.of(open_payload(published, secret.key)) for secret in secrets] != files:
                 raise RuntimeError("the hidden files do not open again from the published file")
         psnr = psnr_between(model, stego)

@@ -103,14 +103,14 @@ def seal(data_key: bytes, payload: Payload, size: int, record: bytes = b"") -> b
     return _masked(data_key, record) + encrypted
 
 
-def unseal(data_key: bytes, sealed: bytes, record_bytes: int = 0) -> tuple[bytes, Payload]:
+def unseal(data_key: bytes, sealed: bytes | memoryview, record_bytes: int = 0) -> tuple[bytes, Payload]:
     """The record and the payload. Raises InputError for damage."""
     record = _masked(data_key, sealed[:record_bytes])
     packed = decrypt(expand(data_key, "payload-key", 32), sealed[record_bytes:], _ASSOCIATED + record)
     return record, unpack_payload(packed)
 
 
-def _masked(data_key: bytes, record: bytes) -> bytes:
+def _masked(data_key: bytes, record: bytes | memoryview) -> bytes:
     """A record, encrypted or decrypted."""
     mask = np.frombuffer(stream(data_key, "record", len(record)), np.uint8)
     return (np.frombuffer(record, np.uint8) ^ mask).tobytes()

@@ -71,7 +71,7 @@ class Codewords:
         _restore(shards, rows, shards.reshape(self.n, self.count, self.width))
         return shards
 
-    def decode(self, numbers: Integers, shards: Bytes, *, errors: bool = False) -> bytes:
+    def decode(self, numbers: Integers, shards: Bytes, *, errors: bool = False) -> memoryview:
         """Decode shards [C, width] with `numbers` [C], in any order.
 
         Ignores numbers with contradictory shards. `errors`: other shards may be false too. Raises InputError
@@ -91,7 +91,7 @@ class Codewords:
             if ((rows >= 0).sum(axis=0) >= self.k).all():
                 data: Bytes = shards[rows[: self.k]]
                 _restore(shards, rows, data)
-                return data.tobytes()
+                return data.reshape(-1).data
         raise InputError(f"{LOST}: {len(np.unique(places)):,} of {self.shards:,} shards are left")
 
     def _drop_errors(self, rows: Integers, shards: Bytes) -> None:

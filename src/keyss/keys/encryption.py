@@ -46,7 +46,7 @@ def encrypt(data_key: bytes, payload: bytes, associated: bytes = b"", *, size: i
     return _cipher(data_key).encrypt(_NONCE, plain, associated)
 
 
-def decrypt(data_key: bytes, encrypted: bytes, associated: bytes = b"") -> bytes:
+def decrypt(data_key: bytes, encrypted: bytes | memoryview, associated: bytes = b"") -> bytes:
     """Decrypt a payload. Raises InputError if anything differs from the result of `encrypt`."""
     try:
         plain = _cipher(data_key).decrypt(_NONCE, encrypted, associated)

@@ -56,11 +56,12 @@ class Steps:
         self.others = np.full((len(means), 2 + near), _ZERO, np.int32)  # candidates for siblings
         self.others[:, 1] = _COLOURS
         if near:
+            means = means[self.order]
             tree = Neighbours(means, near + 1)
 
             def search(start: int, stop: int) -> None:
-                rows = self.order[start:stop]
-                self.others[rows, 2:] = tree.of(means[rows])[1][:, 1:]
+                nearest = tree.of(means[start:stop])[1][:, 1:]
+                self.others[self.order[start:stop], 2:] = self.order[nearest]
 
             def drop(start: int, stop: int) -> None:
                 _drop_mutual(self.order[start:stop], self.others)

@@ -40,7 +40,7 @@ _BLOCK = 16
 
 def function(secret: bytes, label: str, ids: Bytes, size: int = _BLOCK) -> Bytes:
     """[N, size] a pseudo-random function of `ids` [N, 16]; bytes 16 i to 16 i + 15 are AES of (ID xor i)."""
-    key, blocks = expand(secret, f"lsb/{label}", 32), -(-size // _BLOCK)
+    key, blocks = _key(secret, label), -(-size // _BLOCK)
     output = np.empty((len(ids), size), np.uint8)
 
     def work(start: int, stop: int) -> None:
@@ -50,6 +50,10 @@ def function(secret: bytes, label: str, ids: Bytes, size: int = _BLOCK) -> Bytes
 
     in_blocks(work, len(ids), _ROWS)
     return output
+
+
+def _key(secret: bytes, label: str) -> bytes:
+    return expand(secret, f"lsb/{label}", 32)
 
 
 def parameter_pads(data_key: bytes, ids: Bytes) -> Bytes:
@@ -96,14 +100,18 @@ class Message:
 
     def _candidates(self, ids: Bytes) -> Iterator[Integers]:
         """The rows that are looked at for each fragment, its places first."""
-        values = function(self.secret, f"{self.label}/place", ids)
-        order = values[:, :8].copy().view(">u8")[:, 0].astype(np.uint64)
-        count = _CANDIDATES * self.places
-        near = np.argpartition(order, count)[:count] if count < len(order) else np.arange(len(order))
-        near = near[order[near].argsort()]
-        fragment = values[near, 8:12].copy().view("<u4")[:, 0] % self.fragments
+        key, count = _key(self.secret, f"{self.label}/place"), _CANDIDATES * self.places
+
+        def least(start: int, stop: int) -> Integers:
+            order = encrypted_blocks(key, ids[start:stop]).view(">u8")[:, 0].astype(np.uint64)
+            return start + np.argpartition(order, min(count, len(order) - 1))[:count]
+
+        near = np.concatenate(in_blocks(least, len(ids), _ROWS))
+        values = encrypted_blocks(key, ids[near])
+        order = values.view(">u8")[:, 0].argsort()[:count]
+        fragment = values[order, 8:12].copy().view("<u4")[:, 0] % self.fragments
         for index in range(self.fragments):
-            yield near[fragment == index]
+            yield near[order[fragment == index]]
 
 
 @dataclass(frozen=True)

@@ -152,13 +152,14 @@ def chance_of_bits(words: Words32, bits: int) -> float:
     """
     from scipy.special import bdtr  # takes long to load
 
-    flat = words.ravel()
-    context = exponents(flat).astype(np.int64) << 2 | (flat & 1).astype(np.int64) << 1
+    ends = exponents(words).astype(np.int64) << bits | words & np.uint32((1 << bits) - 1)
+    counts = np.bincount(ends.ravel(), minlength=256 << bits)
     chances: list[Doubles] = []
     for bit in range(1, bits):
-        below = (flat >> np.uint32(bit - 1) & 1).astype(np.int64) if bit > 1 else 0
-        times = np.bincount(context | below, minlength=1024)
-        ones = np.bincount((context | below)[(flat >> np.uint32(bit) & 1) == 1], minlength=1024)
+        # Axes: exponent, bits above, this bit, the bit below, bits between, last bit (of bit 1, that below).
+        last = 2 if bit > 1 else 1
+        given = counts.reshape(256, -1, 2, 2, (1 << bit - 1) // last, last).sum(axis=(1, 4))
+        ones, times = given[:, 1].ravel(), given.sum(axis=1).ravel()
         ones, times = ones[times > 0], times[times > 0]
         smaller = np.minimum(ones, times - ones)
         chances.append(np.minimum(1, 2 * bdtr(smaller.astype(np.float64), times, 0.5)))
