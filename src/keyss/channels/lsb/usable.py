@@ -87,8 +87,10 @@ class Carriers:
         if len(gaussians) > _LARGE:
             sample = gaussians[:: len(gaussians) // _SAMPLE]
             Carriers.of(sample, Layout.of(sample))
-        ids, steps = gaussian_ids(gaussians, layout), Steps(gaussians, layout)
-        fine, equal = _without_coincidences(gaussians, layout, ids), steps.equal(DEEPEST)
+        ids = gaussian_ids(gaussians, layout)
+        fine = _without_coincidences(gaussians, layout, ids)
+        steps = Steps(gaussians, layout)
+        equal = steps.equal(DEEPEST)
         fine &= _without_small_even(gaussians, layout, fine & ~equal)
         usable, deepest = fine & ~equal, 0
         for depth in DEPTHS:

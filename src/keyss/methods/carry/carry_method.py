@@ -17,6 +17,7 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.schedule import boost_of
+from keyss.kernels.memory import release
 from keyss.methods.carry.capacity import CarryCapacity, SecretSize, check_appended
 from keyss.methods.carry.carry_options import FINE_TUNING, CarryOptions
 from keyss.methods.codec.model_bytes import decode
@@ -288,7 +289,9 @@ def embed_models(
         )
         for limit, views in zip(capacity.limits(needed), viewpoints, strict=True)
     ]
+    release()
     stego = cover.embed(list(zip(keys, payloads, strict=True)), entropy=entropy)
+    release()
     read = list(map(partial(open_payload, stego), keys))
     if [payload.data for payload in read] != [payload.data for payload in payloads]:
         raise RuntimeError("the embedded secrets do not open again as they should")

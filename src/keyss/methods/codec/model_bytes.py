@@ -116,18 +116,20 @@ class _Encoder:
     @staticmethod
     def of(model: Gaussians, precision: Precision | None) -> _Encoder:
         model = model.detach().to("cpu")
-        order = morton_order(model.means.numpy())
-        some = order[:: 1 + len(order) // _TYPICAL]
+        order, transparent = morton_order(model.means.numpy()), model.overflow.numpy()
+        rows = order[:: 1 + len(order) // _TYPICAL]
+        some = model[torch.from_numpy(rows)]
         middle = [
-            *np.median(model.means.numpy()[some], axis=0),
-            np.median(model.log_scales.numpy()[some]),
-            np.median(model.opacity_logits.numpy()[some]),
+            *np.median(some.means.numpy(), axis=0),
+            np.median(some.log_scales.numpy()),
+            np.median(some.opacity_logits.numpy()),
         ]
         limits = [*[MAX_COORDINATE] * 3, MAX_LOG_SCALE, _MAX_LOGIT]
         centres = [float(np.clip(centre, -most, most)) for centre, most in zip(middle, limits, strict=True)]
         steps = (precision or Precision.usual(model)).steps
-        coder = _Encoder(model, order, model.overflow.numpy(), centres, steps)
-        _, log_scales, logits, _ = _uniform_numbers(coder._uniform_codes(some), centres, steps)
+        coder = _Encoder(model, order, transparent, centres, steps)
+        codes = coder._uniform_codes(some, transparent[rows])
+        _, log_scales, logits, _ = _uniform_numbers(codes, centres, steps)
         return replace(coder, typical=float(np.float32(np.median(_weight(log_scales, logits)))))
 
     @property
@@ -138,34 +140,30 @@ class _Encoder:
     def code(self, start: int, stop: int) -> bytes:
         """Encode Gaussians `start` to `stop` in sorted order."""
         rows = self.order[start:stop]
-        codes = np.empty((len(rows), 10 + 3 * self.model.sh.shape[1]), np.int32)
-        codes[:, :10] = self._uniform_codes(rows)
+        block = self.model[torch.from_numpy(rows)]
+        codes = np.empty((len(block), 10 + 3 * block.sh.shape[1]), np.int32)
+        codes[:, :10] = self._uniform_codes(block, self.transparent[rows])
         _, log_scales, logits, _ = _uniform_numbers(codes[:, :10], self.centres, self.steps)
         finer = _refinement(log_scales, logits, self.typical)
-        quats = with_largest_w(doubles(self.model.quats[rows]))[:, 1:]
+        quats = with_largest_w(doubles(block.quats))[:, 1:]
         codes[:, 10:13] = _round(quats / _steps(self.steps[4], finer))
         harmonics_steps = _steps(self.steps[5], finer).astype(np.float32)
         with np.errstate(over="ignore", invalid="ignore"):  # clamped below
-            harmonics = _to_opponents(self.model.sh.numpy()[rows, 1:] / harmonics_steps[:, None])
-        codes[:, 13:] = _round(harmonics.reshape(len(rows), -1))
+            harmonics = _to_opponents(block.sh.numpy()[:, 1:] / harmonics_steps[:, None])
+        codes[:, 13:] = _round(harmonics.reshape(len(block), -1))
         return entropy.encode(codes, *_columns(self.model.sh_degree))
 
-    def _uniform_codes(self, rows: Integers) -> Doubles:
+    def _uniform_codes(self, block: Gaussians, transparent: Flags) -> Doubles:
         """Codes [R, 10] of means, log scales, opacity logits and constant colours.
 
         Rasterizers skip Gaussians whose numbers overflow. Clamped numbers would make these visible, so they
         become transparent.
         """
         means, log_scales, logits, colours = (
-            doubles(tensor[rows])
-            for tensor in (
-                self.model.means,
-                self.model.log_scales,
-                self.model.opacity_logits[:, None],
-                self.model.sh[:, 0],
-            )
+            doubles(tensor)
+            for tensor in (block.means, block.log_scales, block.opacity_logits[:, None], block.sh[:, 0])
         )
-        logits[self.transparent[rows]] = -_MAX_LOGIT
+        logits[transparent] = -_MAX_LOGIT
         parts = [
             means.clip(-MAX_COORDINATE, MAX_COORDINATE),
             log_scales.clip(-MAX_LOG_SCALE, MAX_LOG_SCALE),
