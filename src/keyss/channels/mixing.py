@@ -45,7 +45,10 @@ def random_words(secret: bytes, label: str, count: int) -> Words:
 
 def random_order(secret: bytes, label: str, count: int) -> Integers:
     """A permutation [count] derived from a secret."""
-    return random_words(secret, label, count).argsort(kind="stable")
+    # Sorted with their numbers in the lower half: the same on all machines, and faster than `argsort`.
+    lower = np.uint64(2**32 - 1)
+    words = random_words(secret, label, count) & ~lower | np.arange(count, dtype=np.uint64)
+    return (np.sort(words) & lower).astype(np.int64)
 
 
 def random_fractions(secret: bytes, label: str, count: int) -> Doubles:

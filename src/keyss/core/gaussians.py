@@ -93,7 +93,8 @@ class Gaussians:
         """The Gaussians that a boolean mask, an index tensor or a slice selects."""
         if isinstance(index, slice):
             return self.map(lambda tensor: tensor[index])
-        rows = (index.nonzero()[:, 0] if index.dtype == torch.bool else index).to(self.device)
+        index = torch.as_tensor(index, device=self.device)
+        rows = index.nonzero()[:, 0] if index.dtype == torch.bool else index
         return self.map(lambda tensor: tensor.index_select(0, rows))  # takes a fifth of `tensor[rows]`
 
     def to(self, device: torch.device | str) -> Gaussians:

@@ -42,7 +42,7 @@ def encrypt(data_key: bytes, payload: bytes, associated: bytes = b"", *, size: i
     flag, packed = _compress(payload)
     if size < len(packed) + OVERHEAD:
         raise ValueError(f"{len(packed)} bytes do not fit into {size}")
-    plain = (struct.pack("<I", flag | len(packed)) + packed).ljust(size - 16, b"\0")
+    plain = b"".join([struct.pack("<I", flag | len(packed)), packed, bytes(size - len(packed) - OVERHEAD)])
     return _cipher(data_key).encrypt(_NONCE, plain, associated)
 
 

@@ -134,9 +134,10 @@ class Shards:
     def numbers(self, ids: Bytes) -> Integers | None:
         """[R] numbers of the shards that `ids` [R, 16] hold; all occur. None if a group is too small."""
         group = self._function(ids)[2]
-        order, sizes = group.argsort(kind="stable"), np.bincount(group, minlength=self.groups)
+        sizes = np.bincount(group, minlength=self.groups)
         if sizes.min() < self.in_group:
             return None
+        order = group.astype(np.uint16).argsort(kind="stable")  # 16 bits take a tenth of the time
         place = np.arange(len(ids)) - np.repeat(sizes.cumsum() - sizes, sizes)
         groups = np.empty(len(ids), np.int64)
         groups[order] = self._number(group[order], place % self.in_group)

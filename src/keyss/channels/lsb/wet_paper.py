@@ -12,6 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from keyss.channels.mixing import random_order
 from keyss.core.arrays import Bits, Bytes, Integers
 from keyss.kernels.jit import kernel
 from keyss.keys.derivation import stream
@@ -24,11 +25,7 @@ _PUBLIC = bytes(32)  # seed
 
 def places(count: int) -> Integers:
     """[B x BLOCK] indices of the bits of all blocks, a public permutation of `count` bits."""
-    numbers = np.frombuffer(stream(_PUBLIC, "codes/order", 8 * count), "<u8")
-    # Sorted with their numbers in the lower half: the same on all machines, and faster than `argsort`.
-    lower = np.uint64(2**32 - 1)
-    order = (np.sort(numbers & ~lower | np.arange(count, dtype=np.uint64)) & lower).astype(np.int64)
-    return order[: count // BLOCK * BLOCK]
+    return random_order(_PUBLIC, "codes/order", count)[: count // BLOCK * BLOCK]
 
 
 def width_of(dry: Bits) -> int:
