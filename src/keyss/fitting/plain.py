@@ -98,9 +98,6 @@ def _target(view: View, size: tuple[int, int], device: torch.device) -> Target:
     return Target.of(image.to(device), mask)
 
 
-_NOTED = 0.99  # share of the Gaussians that stay, below which a fit says so
-
-
 def fit_scene(
     scene: Scene,
     config: FitConfig | None = None,
@@ -129,8 +126,8 @@ def fit_scene(
     train(run, title, fingerprint=fingerprint, checkpoint=checkpoint, resume=resume, reporter=reporter)
     fitted = run.gaussians().to("cpu")
     kept = without_faint(fitted, config.prune_opacity) if run.grows else fitted
-    if reporter is not None and len(kept) < _NOTED * len(fitted):
-        reporter.note(f"{title}: {len(fitted) - len(kept):,} Gaussians that became transparent are left out")
+    if reporter is not None and len(kept) < len(fitted):
+        reporter.note(f"{title}: {len(kept):,} Gaussians stay; the others became transparent")
     return FitResult(kept, config)
 
 

@@ -59,7 +59,7 @@ def audit(
 
     example: keyss audit runs/hidden --key-file key.txt --only stealth --only leaks
     """
-    check_exists(run, *key_file)
+    check_exists(run, keys=key_file)
     measure = verb("audit")
     from keyss import progress
     from keyss.cli.keys import keys_of_run
