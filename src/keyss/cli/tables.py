@@ -41,11 +41,11 @@ _HEADS = {
     "plain": "plain: Gaussians of the plain model",
     "steps": "steps: training steps",
 }
-# What `info` says of a number.
+# What `info` says of a number: {0} is its text, {1} the number.
 _MEANINGS = {
-    "bounding_box": "{}: two corners, in the model's units",
-    "nearly_transparent": "{} of the Gaussians, those with opacities below 0.05",
-    "extent": "{}: distance of the farthest camera from their middle plus a tenth, in the scene's units",
+    "bounding_box": "{0}: two corners, in the model's units",
+    "nearly_transparent": "{1:.0%} of the Gaussians, those with opacities below 0.05",
+    "extent": "{0}: distance of the farthest camera from their middle plus a tenth, in the scene's units",
 }
 _ROUNDED = 20 * math.log10(255 * math.sqrt(12))  # PSNR of the error of rounding to 8 bits
 _SHOWS = 1.0  # dB below the secret at which a wrong key shows as much
@@ -197,7 +197,7 @@ def print_info(described: RunInfo | InterruptedRun | ModelInfo | SceneInfo) -> N
         facts = {name: value for name, value in vars(described).items() if value is not None}
         capacity = facts.pop("capacity", ())
         rows = [
-            (name.replace("_", " "), _MEANINGS.get(name, "{}").format(_text(value)))
+            (name.replace("_", " "), _MEANINGS.get(name, "{0}").format(_text(value), value))
             for name, value in facts.items()
         ]
         print_columns([*rows, *(("capacity", line) for line in capacity)])
