@@ -118,7 +118,7 @@ def load_scene(
                 damaged.append(photo.name)
     leave_out(folder, len(layout.train + layout.test), "cannot be read", damaged, skip_missing)
     if behind is None:
-        behind = under if transparent else _plain_background(views)
+        behind = under if transparent else plain_background([(view.image, view.mask) for view in views])
     held_out = {photo.name for photo in layout.test}
     if shares := [float((~view.mask).float().mean()) for view in views if view.mask is not None]:
         warnings.warn(
@@ -138,13 +138,16 @@ def load_scene(
     )
 
 
-def _plain_background(views: Sequence[View]) -> Tensor:
-    """[3] The colour around an object before a plain background, black if there is none."""
+def plain_background(photos: Sequence[tuple[Tensor, Tensor | None]]) -> Tensor:
+    """[3] in [0, 1]: the colour around an object before a plain background, black if there is none.
+
+    `photos`: uint8 images [H, W, 3] and masks [H, W] of the pixels that count.
+    """
     pixels = []
-    for view in views:
-        edges = torch.ones(view.image.shape[:2], dtype=torch.bool)
+    for image, mask in photos:
+        edges = torch.ones(image.shape[:2], dtype=torch.bool)
         edges[1:-1, 1:-1] = False
-        pixels.append(view.image[edges if view.mask is None else edges & view.mask])
+        pixels.append(image[edges if mask is None else edges & mask])
     around = torch.cat(pixels).float()
     if not len(around):
         return torch.zeros(3)
