@@ -78,7 +78,7 @@ class Photos:
         optional(
             "R G B",
             "Background colour, 0 to 1 each; transparent photos are composited over it.",
-            "white for transparent photos, else black",
+            "white for transparent photos, else that of their edges if it is plain, else black",
         ),
     ] = None
     skip_missing: Annotated[
