@@ -120,7 +120,7 @@ def test_published_models_need_a_key_or_force(keyss: Run, files: Path, tmp_path:
     package.hide(trained_like(1500), [package.Secret(trained_like(COUNT, 1), KEY)], out=out)
     model = out / "publish" / "model.ply"
     convert = ("convert", model, "-o", tmp_path / "out.spz")
-    assert_refused(keyss(*convert), 7, "with a secret, which this format may destroy: --key-file")
+    assert_refused(keyss(*convert), 7, "with a secret, which this format may destroy: give its --key-file")
     assert "would be lost" in keyss(*convert, "--dry-run").out
     assert keyss(*convert, "--force").status == 0
     assert keyss("convert", model, "-o", tmp_path / "out.ply").status == 0

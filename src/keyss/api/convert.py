@@ -77,8 +77,8 @@ def convert(
         check_not_published(path)
     if source and not (keys or force or dry_run) and not keeps_low_bits(path) and is_published(source):
         raise QualityError(
-            f"{source} was published with a secret, which this format may destroy: `keys` check that, and "
-            "`force=True` converts it without; nothing was written"
+            f"{source} was published with a secret, which this format may destroy: give its `keys` to "
+            "check, or convert the model without it: `force=True`; nothing was written"
         )
     before = as_model(model if source is None else source)
     opened = [reveal_secret(before, key, target) for key in keys]
