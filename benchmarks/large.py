@@ -131,7 +131,7 @@ def commands(folder: Path, format: str) -> dict[str, list[Any]]:
     stego = folder / "run/publish" / f"model.{SUFFIXES[format]}"
     found = {
         "floor": [sys.executable, "-c", FLOOR, cover, secret, folder / "floor"],
-        "convert": [*program, "convert", cover, folder / "copy.ply", "--overwrite"],
+        "convert": [*program, "convert", cover, "-o", folder / "copy.ply", "--overwrite"],
         "hide": [*program, "hide", *models, *published, *key, "-o", folder / "run"],
         "info": [*program, "info", folder / "cover.ply"],
         "verify": [*program, "verify", stego],

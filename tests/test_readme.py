@@ -18,10 +18,10 @@ def test_python_example(
 ) -> None:
     (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert len(example.splitlines()) <= 10
-    short = "import keyss\n" + example.replace("views=views, out", SHORT + "views=views, out")
+    short = "import keyss\n" + example.replace('preset="quick", ', SHORT)
     assert SHORT in short
-    write_blender(tmp_path / "scenes" / "bonsai", count=2)
-    write_nerfstudio(tmp_path / "scenes" / "fox")
+    write_blender(tmp_path / "out" / "demo" / "scenes" / "tea-table", count=2)
+    write_nerfstudio(tmp_path / "out" / "demo" / "scenes" / "golden-knot")
     monkeypatch.chdir(tmp_path)
     exec(compile(short, "README.md", "exec"), {})
     assert "100 Gaussians" in capsys.readouterr().out

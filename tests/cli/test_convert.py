@@ -35,7 +35,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("suffix", ["spz", "glb", "ply"])
 def test_reports_quality(keyss: Run, files: Path, tmp_path: Path, suffix: str) -> None:
     out = tmp_path / f"out.{suffix}"
-    result = keyss("convert", files / "plain.ply", out)
+    result = keyss("convert", files / "plain.ply", "-o", out)
     assert result.status == 0
     first, *others = result.out.splitlines()
     assert first.startswith(f"{out}: {COUNT} Gaussians, {out.stat().st_size / 1e3:.1f} kB, ")
@@ -56,14 +56,14 @@ def test_reports_quality(keyss: Run, files: Path, tmp_path: Path, suffix: str) -
 @pytest.mark.parametrize("unit", [1e-4, 1e-3, 1.0, 1e3, 1e6])
 def test_spz_scale_warning(keyss: Run, tmp_path: Path, unit: float) -> None:
     write_model(tmp_path / "in.ply", Similarity(unit).apply_gaussians(random_gaussians(COUNT)))
-    result = keyss("convert", tmp_path / "in.ply", tmp_path / "out.spz")
+    result = keyss("convert", tmp_path / "in.ply", "-o", tmp_path / "out.spz")
     assert result.status == 0
     assert ("of the Gaussians are smaller" in result.err) == (unit in (1e-4, 1e6))
     psnr = float(result.out.split("renders at ")[1].split()[0])
     if unit in (1e-4, 1e6):
         factor = float(result.err.split(" -s ")[1].split()[0])
         write_model(tmp_path / "in.ply", Similarity(factor * unit).apply_gaussians(random_gaussians(COUNT)))
-        result = keyss("convert", tmp_path / "in.ply", tmp_path / "scaled.spz")
+        result = keyss("convert", tmp_path / "in.ply", "-o", tmp_path / "scaled.spz")
         assert "smaller" not in result.err
         assert float(result.out.split("renders at ")[1].split()[0]) > psnr + 10
     else:
@@ -80,10 +80,10 @@ def test_quality_is_scale_invariant(keyss: Run, tmp_path: Path, unit: float) -> 
     for name, scale in (("one", 1.0), ("other", unit)):
         changed = Similarity(scale=scale).apply_gaussians(model)
         write_model(tmp_path / f"{name}.ply", changed)
-        result = keyss("convert", tmp_path / f"{name}.ply", tmp_path / f"{name}.compressed.ply").out
+        result = keyss("convert", tmp_path / f"{name}.ply", "-o", tmp_path / f"{name}.compressed.ply").out
         costs.append(float(result.split("renders at ")[1].split()[0]))
     assert costs[0] == pytest.approx(costs[1], abs=1.0)
-    result = keyss("convert", tmp_path / "other.ply", tmp_path / "other.spz")
+    result = keyss("convert", tmp_path / "other.ply", "-o", tmp_path / "other.spz")
     assert "renders the same" not in result.out
     assert len(read_model(tmp_path / "other.spz").means.unique(dim=0)) == COUNT or unit < 1e-4
 
@@ -101,10 +101,12 @@ def test_verbs_accept_every_format(keyss: Run, files: Path, suffix: str) -> None
 
 def test_losing_a_secret_needs_force(keyss: Run, files: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.spz"
-    convert = ("convert", files / "carried.ply", out, "--key-file", files / "key")
+    convert = ("convert", files / "carried.ply", "-o", out, "--key-file", files / "key")
     refused = keyss(*convert)
     assert_refused(refused, 7, "Gaussians would be left in")
-    assert "nothing was written; --force writes it anyway" in refused.err
+    assert "hide it with --publish converted or --format spz, or convert the model without it: --force" in (
+        refused.err
+    )
     assert not out.exists()
     assert "is lost: 0 Gaussians are left" in keyss(*convert, "--dry-run").out
     assert not out.exists()
@@ -112,9 +114,24 @@ def test_losing_a_secret_needs_force(keyss: Run, files: Path, tmp_path: Path) ->
     assert out.exists()
 
 
+def test_published_models_need_a_key_or_force(keyss: Run, files: Path, tmp_path: Path) -> None:
+    """A run tells that its file holds a secret, and nothing else does."""
+    out = tmp_path / "run"
+    package.hide(trained_like(1500), [package.Secret(trained_like(COUNT, 1), KEY)], out=out)
+    model = out / "publish" / "model.ply"
+    convert = ("convert", model, "-o", tmp_path / "out.spz")
+    assert_refused(keyss(*convert), 7, "with a secret, which this format may destroy: give its --key-file")
+    assert "would be lost" in keyss(*convert, "--dry-run").out
+    assert keyss(*convert, "--force").status == 0
+    assert keyss("convert", model, "-o", tmp_path / "out.ply").status == 0
+    model.rename(tmp_path / "moved.ply")
+    convert = ("convert", tmp_path / "moved.ply", "-o", tmp_path / "out.spz", "--overwrite")
+    assert "are lost" in keyss(*convert).out
+
+
 def test_secret_survives_ply_to_ply(keyss: Run, files: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.ply"
-    result = keyss("convert", files / "carried.ply", out, "--key-file", files / "key")
+    result = keyss("convert", files / "carried.ply", "-o", out, "--key-file", files / "key")
     assert result.status == 0
     assert "Gaussians, survives" in result.out
     assert keyss("reveal", out, "--key-file", files / "key", "-o", tmp_path / "secret.ply").status == 0
@@ -124,23 +141,23 @@ def test_losing_a_hidden_file_needs_force(keyss: Run, files: Path, tmp_path: Pat
     stego = package.hide(trained_like(2500), [package.SecretFile(b"a letter" * 20, "q7Rv2LxT9bWm4KzD")]).stego
     write_model(tmp_path / "stego.ply", stego)
     key = ("--key-file", files / "other")
-    refused = keyss("convert", tmp_path / "stego.ply", tmp_path / "out.sog", *key)
+    refused = keyss("convert", tmp_path / "stego.ply", "-o", tmp_path / "out.sog", *key)
     assert_refused(refused, 7, "0 of its 160 bytes would be left in")
-    result = keyss("convert", tmp_path / "stego.ply", tmp_path / "out.ply", *key)
+    result = keyss("convert", tmp_path / "stego.ply", "-o", tmp_path / "out.ply", *key)
     assert "160 bytes, survives" in result.out
 
 
 def test_invalid_outputs(keyss: Run, files: Path, tmp_path: Path) -> None:
     plain = files / "plain.ply"
-    assert_refused(keyss("convert", plain, tmp_path / "a.lcc"), 2, "expected a name that ends in")
-    assert_refused(keyss("convert", files / "key", tmp_path / "a.ply"), 4, "expected a 3DGS model")
+    assert_refused(keyss("convert", plain, "-o", tmp_path / "a.lcc"), 2, "expected a name that ends in")
+    assert_refused(keyss("convert", files / "key", "-o", tmp_path / "a.ply"), 4, "expected a 3DGS model")
     wrong_key = ("--key-file", files / "other")
     assert_refused(
-        keyss("convert", files / "carried.ply", tmp_path / "a.ply", *wrong_key), 3, "opens nothing"
+        keyss("convert", files / "carried.ply", "-o", tmp_path / "a.ply", *wrong_key), 3, "opens nothing"
     )
     (tmp_path / "there.spz").touch()
-    assert_refused(keyss("convert", plain, tmp_path / "there.spz"), 5, "exists")
-    assert keyss("convert", plain, tmp_path / "there.spz", "--overwrite").status == 0
+    assert_refused(keyss("convert", plain, "-o", tmp_path / "there.spz"), 5, "exists")
+    assert keyss("convert", plain, "-o", tmp_path / "there.spz", "--overwrite").status == 0
     arguments = ("--cover", plain, "--secret", plain, "--method", "carry", "--key-file", files / "key")
     assert_refused(keyss("hide", *arguments, "-o", tmp_path / "a.spz"), 2, "expected the name of a folder")
 
@@ -149,7 +166,7 @@ def test_invalid_outputs(keyss: Run, files: Path, tmp_path: Path) -> None:
 def test_output_keeps_permissions(keyss: Run, tmp_path: Path, mode: int) -> None:
     write_model(tmp_path / "m.ply", random_gaussians(50))
     (tmp_path / "m.ply").chmod(mode)
-    assert keyss("convert", tmp_path / "m.ply", tmp_path / "m.spz").status == 0
+    assert keyss("convert", tmp_path / "m.ply", "-o", tmp_path / "m.spz").status == 0
     assert keyss("view", tmp_path / "m.ply", "-o", tmp_path / "page.html").status == 0
     assert keyss("view", tmp_path / "m.ply", "-o", tmp_path / "page").status == 0
     made = [tmp_path / "m.spz", tmp_path / "page.html", *(tmp_path / "page").iterdir()]
@@ -161,7 +178,7 @@ def test_training_folder_as_model(keyss: Run, tmp_path: Path) -> None:
         folder = tmp_path / "trained" / "point_cloud" / f"iteration_{number}"
         folder.mkdir(parents=True)
         write_model(folder / "point_cloud.ply", trained_like(COUNT + number // 10))
-    result = keyss("convert", tmp_path / "trained", tmp_path / "a.spz")
+    result = keyss("convert", tmp_path / "trained", "-o", tmp_path / "a.spz")
     assert result.err.count("its model is point_cloud/iteration_30000/point_cloud.ply") == 1
     assert len(read_model(tmp_path / "a.spz")) == COUNT + 3000
 

@@ -1,4 +1,4 @@
-"""`keyss hide --dry-run` prints the plan and writes nothing."""
+"""`--dry-run` of `keyss hide` and `keyss fit` prints the plan and writes nothing."""
 
 from __future__ import annotations
 
@@ -20,4 +20,11 @@ def test_dry_run(keyss: Run, workspace: Path, tmp_path: Path) -> None:
     result = keyss("hide", *scenes, "-o", tmp_path / "out", *SMALL, "--dry-run")
     assert result.status == 0
     assert "falling back to --publish converted" in result.err  # too few for low bits
+    assert listing(tmp_path) == {}
+
+
+def test_dry_run_of_a_fit(keyss: Run, workspace: Path, tmp_path: Path) -> None:
+    result = keyss("fit", workspace / "a", "-o", tmp_path / "out", *SMALL, "--dry-run")
+    assert result.status == 0, result.err
+    assert all(re.search(rf"^{word} +", result.out, re.M) for word in ("model", "training", "time", "memory"))
     assert listing(tmp_path) == {}

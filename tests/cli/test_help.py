@@ -97,7 +97,6 @@ def test_usage_errors(keyss: Run, arguments: tuple[str, ...]) -> None:
         (("Hide",), "did you mean `keyss hide`?"),
         (("--quiet", "inof", "x"), "did you mean `keyss info`?"),
         (("frobnicate",), "see `keyss --help`"),
-        (("convert", "a.ply", "-o", "b.spz"), "name OUT after IN"),
         (("audit", "run", "-o", "x"), "results go into the folder of the run"),
         (("audit", "run", "--quick"), "--only PART"),
         (("hide", "--cover", "a", "--secret", "b", "-o", "c", "--quick"), "give --preset quick"),

@@ -135,7 +135,7 @@ def test_hidden_file_survives_conversion(keyss: Run, folder: Path, tmp_path: Pat
     result = keyss(*hide, "--publish", "converted", "-o", out)
     assert (result.status, result.err) == (0, "")
     assert "may be converted" in result.out
-    result = keyss("convert", out / "publish" / "model.ply", tmp_path / "web.spz", *key)
+    result = keyss("convert", out / "publish" / "model.ply", "-o", tmp_path / "web.spz", *key)
     assert (result.status, result.err) == (0, "")
     assert keyss("reveal", tmp_path / "web.spz", *key, "-o", tmp_path / "back").status == 0
     assert (tmp_path / "back").read_bytes() == (tmp_path / "note.txt").read_bytes()

@@ -14,7 +14,7 @@ import keyss as library
 from channels.lsb.trained_like import trained_like
 from cli.harness import SMALL, Run, assert_refused
 from files.scene_files import write_nerfstudio
-from keyss.files import load_scene, write_model
+from keyss.files import load_scene, read_model, write_model
 from keyss.fitting import FitConfig
 from keyss.progress import Reporter
 
@@ -79,11 +79,15 @@ def test_capacity(keyss: Run, tmp_path: Path) -> None:
     assert all(word in plain for word in ("two corners", "opacities below 0.05", "--capacity", "verify"))
     out = keyss("info", tmp_path / "cover.ply", "--capacity").out
     assert re.search(
-        r"--format ply: \d+,\d+ bytes, a model of about \d+,?\d* Gaussians of SH degree 3 or \d+,?\d* ", out
+        r"--format ply: \d+,\d+ bytes in low bits, a model of about \d+,?\d* Gaussians of SH degree 3 ", out
     )
     for words in ("--format spz: ", "--format sog: ", "--format compressed-ply: ", "--channel colours: "):
         assert words in out
     assert "--publish converted: 5,999,820 bytes" in out
+    write_model(tmp_path / "small.spz", trained_like(1500))
+    write_model(tmp_path / "decoded.ply", read_model(tmp_path / "small.spz"))
+    out = keyss("info", tmp_path / "decoded.ply", "--capacity").out
+    assert re.search(r"--format ply: .* bytes in values of the spz file that the cover was decoded from", out)
 
 
 def test_capacity_is_of_a_model(keyss: Run, workspace: Path) -> None:

@@ -153,6 +153,6 @@ def test_key_from_standard_input(keyss: Run, tmp_path: Path, monkeypatch: pytest
 def test_output_onto_a_dangling_link(keyss: Run, tmp_path: Path) -> None:
     write_model(tmp_path / "a.ply", trained_like(50))
     (tmp_path / "out.ply").symlink_to(tmp_path / "nowhere.ply")
-    refused = keyss("convert", tmp_path / "a.ply", tmp_path / "out.ply")
+    refused = keyss("convert", tmp_path / "a.ply", "-o", tmp_path / "out.ply")
     assert_refused(refused, 5, "is a link to")
     assert (tmp_path / "out.ply").is_symlink()

@@ -111,7 +111,7 @@ def test_hide_reveal_view_convert(keyss: Run, tmp_path: Path, kind: str) -> None
     assert result.status == 0, result.err
     assert len(read_model(revealed)) == 30
     assert keyss("view", model, "-o", tmp_path / "page.html").status == 0
-    result = keyss("convert", model, tmp_path / "model.spz")
+    result = keyss("convert", model, "-o", tmp_path / "model.spz")
     assert result.status == 0 or (kind == "one stray Gaussian" and "remove Gaussians far out" in result.err)
 
 

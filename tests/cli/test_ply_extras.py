@@ -55,11 +55,11 @@ def check_extras(path: Path, extra: dict[str, np.ndarray], rows: slice = slice(N
 def test_convert_keeps_extra_properties(keyss: Run, tmp_path: Path, form: str) -> None:
     model = trained_like(COUNT)
     extra = write_extended(model, tmp_path / "a.ply", form)
-    result = keyss("convert", tmp_path / "a.ply", tmp_path / "b.ply")
+    result = keyss("convert", tmp_path / "a.ply", "-o", tmp_path / "b.ply")
     assert "renders the same" in result.out
     check_extras(tmp_path / "b.ply", extra)
     assert read_model(tmp_path / "b.ply").digest() == model.digest()
-    assert keyss("convert", tmp_path / "a.ply", tmp_path / "c.spz").status == 0  # has no room for them
+    assert keyss("convert", tmp_path / "a.ply", "-o", tmp_path / "c.spz").status == 0  # has no room for them
 
 
 @pytest.mark.parametrize(

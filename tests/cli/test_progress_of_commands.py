@@ -30,7 +30,7 @@ COMMANDS = {
     "hide --secret-file": (*FILE, "-o", "{1}/run"),
     "reveal": ("reveal", STEGO, *KEY, "-o", "{1}/secret.ply"),
     "verify": ("verify", STEGO, *KEY),
-    "convert": ("convert", STEGO, "{1}/model.sog", *KEY, "--force"),
+    "convert": ("convert", STEGO, "-o", "{1}/model.sog", *KEY, "--force"),
     "info --capacity": ("info", "{0}/a.ply", "--capacity"),
     "view -o": ("view", STEGO, "-o", "{1}/page.html"),
     "render": ("render", STEGO, "-o", "{1}/turn.webp"),

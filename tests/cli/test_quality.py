@@ -26,6 +26,15 @@ def test_min_psnr(keyss: Run, workspace: Path, tmp_path: Path) -> None:
     assert (tmp_path / "run" / "publish" / "model.ply").exists()
 
 
+def test_joint_training_names_its_own_cure(keyss: Run, workspace: Path, tmp_path: Path) -> None:
+    """Its secrets are not pruned, and --publish converted is not for it."""
+    hide = ["hide", "--method", "keyss", *scene_arguments(workspace), "-o", tmp_path / "run", *SMALL]
+    result = keyss(*hide, "--min-psnr", 90)
+    assert result.status == 7
+    assert "more training steps (--iterations) bring it nearer" in result.err
+    assert "--publish converted" not in result.err
+
+
 @pytest.fixture
 def models(tmp_path: Path) -> Path:
     write_model(tmp_path / "cover.ply", trained_like(3000))

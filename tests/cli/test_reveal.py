@@ -233,7 +233,13 @@ class TestVerify:
 
     def test_which_of_two_keys_opens_nothing(self, keyss: Run, files: Path) -> None:
         given = ("--key-file", files / "key", "--key-file", files / "other")
-        assert_refused(keyss("verify", files / "whole.ply", *given), 3, "key 2 of 2: this key opens nothing")
+        refused = keyss("verify", files / "whole.ply", *given)
+        assert_refused(refused, 3, "key 2 of 2: this key opens nothing")
+        assert "; the model itself: sound" in refused.err
+
+    def test_missing_key_file(self, keyss: Run, files: Path) -> None:
+        refused = keyss("verify", files / "whole.ply", "--key-file", files / "none")
+        assert_refused(refused, 4, "none does not exist; `keyss keygen -o FILE` makes a key")
 
     def test_damaged_secret(self, keyss: Run, files: Path) -> None:
         result = keyss("verify", files / "pruned.ply", "--key-file", files / "key")

@@ -36,7 +36,7 @@ def test_quiet_prints_paths_only(keyss: Run, tmp_path: Path) -> None:
     write_model(tmp_path / "a.ply", random_gaussians(50))
     commands = {
         "key.txt": ("keygen", "-o", tmp_path / "key.txt"),
-        "a.spz": ("convert", tmp_path / "a.ply", tmp_path / "a.spz"),
+        "a.spz": ("convert", tmp_path / "a.ply", "-o", tmp_path / "a.spz"),
         "page.html": ("view", tmp_path / "a.ply", "-o", tmp_path / "page.html"),
         "turn.webp": ("render", tmp_path / "a.ply", "-o", tmp_path / "turn.webp", "--width", 16),
     }

@@ -21,6 +21,7 @@ from files.scene_files import (
     frames,
     image_bytes,
     photo,
+    save,
     write_blender,
     write_colmap,
     write_nerfstudio,
@@ -29,6 +30,35 @@ from keyss.core import InputError, KeyssWarning
 from keyss.files import load_scene
 
 WRITERS = {"colmap": write_colmap, "blender": write_blender, "nerfstudio": write_nerfstudio}
+
+
+def around(folder: Path, colour: int, masked: bool = False) -> list[float]:
+    """The background of a scene of random photos whose edges have `colour`, up to the noise of a JPEG."""
+    write_colmap(folder)
+    for index, path in enumerate(sorted((folder / "images").iterdir())):
+        pixels = np.clip(photo(index) // 64 + colour - 2, 0, 255).astype(np.uint8)
+        pixels[1:-1, 1:-1] = photo(index)[1:-1, 1:-1]
+        if masked:
+            pixels[0] = photo(index)[0]
+            keep = np.full((HEIGHT, WIDTH), 255, np.uint8)
+            keep[0] = 0
+            save(folder / "masks" / path.name, keep)
+        save(path, pixels)
+    return [float(value) for value in load_scene(folder).background * 255]
+
+
+@pytest.mark.parametrize("colour", [2, 128, 250])
+def test_plain_backgrounds_are_found(tmp_path: Path, colour: int) -> None:
+    assert around(tmp_path, colour) == pytest.approx([colour] * 3, abs=2)
+
+
+@pytest.mark.filterwarnings("ignore::keyss.core.KeyssWarning")  # of masks
+def test_masked_edges_do_not_count(tmp_path: Path) -> None:
+    assert around(tmp_path, 128, masked=True) == pytest.approx([128] * 3, abs=2)
+
+
+def test_edges_of_many_colours_are_no_background(tmp_path: Path) -> None:
+    assert load_scene(write_colmap(tmp_path)).background.tolist() == [0, 0, 0]
 
 
 def test_every_eighth_photo_is_a_test_view(tmp_path: Path) -> None:

@@ -57,6 +57,20 @@ def test_fit_improves_psnr() -> None:
     assert len(start) < len(fitted) <= config.max_gaussians
 
 
+def test_faint_gaussians_are_removed_at_the_end() -> None:
+    """Of the model, and of the number that progress reports."""
+    counts: list[int] = []
+
+    class Counting(Reporter):
+        def update(self, iteration: int, gaussians: int, numbers: dict[str, float]) -> None:
+            counts.append(gaussians)
+
+    config = replace(CONFIG, iterations=20, grow_stop=0.0, prune_opacity=0.1)  # points begin at 0.1
+    fitted = fit_scene(tiny_scene(), config, reporter=Counting()).gaussians
+    assert len(fitted) == counts[-1] < counts[-2]
+    assert fitted.opacities.min() >= 0.1
+
+
 def test_masked_pixels_are_ignored() -> None:
     scene, config = tiny_scene(views=32), replace(CONFIG, iterations=300)
     generator = torch.Generator().manual_seed(5)

@@ -7,9 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from urllib.parse import parse_qs
 
+import numpy as np
 import pytest
 import torch
 
+from files.scene_files import save, write_nerfstudio
 from keyss.core import Camera, Gaussians, camera_positions
 from keyss.files import load_scene, write_model
 from keyss.rendering import frame_of
@@ -71,6 +73,15 @@ def test_first_test_photo(folders: tuple[Path, Path]) -> None:
     torch.testing.assert_close(shown.position, first.camera.position, atol=1e-4, rtol=0)
     torch.testing.assert_close(shown.viewmat[2, :3], first.camera.viewmat[2, :3], atol=1e-4, rtol=0)
     assert torch.cdist(shown.position[None], camera_positions([v.camera for v in scene.train])).min() > 0.1
+
+
+def test_background_of_the_photos(tmp_path: Path) -> None:
+    scene = write_nerfstudio(tmp_path)
+    assert look_of_scene(scene)["background"] == "#000000"
+    for path in (scene / "images").iterdir():
+        save(path, np.full((8, 12, 3), (255, 0, 128), np.uint8))
+    assert look_of_scene(scene)["background"] == "#ff0080"
+    assert look_of_scene(scene, (0.2, 1, 0))["background"] == "#33ff00"
 
 
 @pytest.mark.skipif(PROGRAM is None, reason="no Chromium on PATH")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 
+from keyss.channels import SUFFIXES
 from keyss.core.errors import InputError, QualityError, UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.files.atomic import mode_like, write_bytes
@@ -18,7 +19,7 @@ from keyss.files.inputs import is_standard, write_standard_output
 from keyss.files.models import check_model_output, holds, keeps_low_bits, model_bytes, model_of_bytes
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_visible, psnr_between
-from keyss.runs.files import PathLike, as_model
+from keyss.runs.files import PathLike, as_model, is_published
 from keyss.runs.folder import check_not_published
 from keyss.runs.revealing import reveal_secret
 
@@ -63,16 +64,22 @@ def convert(
 ) -> Conversion:
     """Write a model in the format of the suffix of `out`, and measure the loss.
 
-    Raises QualityError and writes nothing if a secret that one of `keys` opens would be lost, unless with
-    `force`. The file gets the permissions of `model`. `dry_run` writes nothing at all. Without keys, the
-    result does not reveal whether something is hidden. Raises WrongKeyError for a key that opens nothing,
-    InputError, OutputError, and UsageError for an unknown suffix.
+    Without `force`, raises QualityError and writes nothing if a secret that one of `keys` opens would be
+    lost, or if `model` is the published file of a run and there are no keys to check that. The file gets the
+    permissions of `model`. `dry_run` writes nothing at all. Without keys, the result does not reveal whether
+    something is hidden. Raises WrongKeyError for a key that opens nothing, InputError, OutputError, and
+    UsageError for an unknown suffix.
     """
     target = resolve_device(device)
     source = None if isinstance(model, Gaussians) else model_file(model)
     path = check_model_output(out, overwrite, [source] if source else [])
     if not is_standard(path):
         check_not_published(path)
+    if source and not (keys or force or dry_run) and not keeps_low_bits(path) and is_published(source):
+        raise QualityError(
+            f"{source} was published with a secret, which this format may destroy: give its `keys` to "
+            "check, or convert the model without it: `force=True`; nothing was written"
+        )
     before = as_model(model if source is None else source)
     opened = [reveal_secret(before, key, target) for key in keys]
     data = model_bytes(path, with_extras(before, source, before))
@@ -113,4 +120,9 @@ def _refusal(path: Path, result: Conversion, lost: Sequence[int]) -> str:
     which = "the secret that the key opens" if len(result.secrets) == 1 else f"the secret of key {lost[0]}"
     left = f"{first.after:,} of its {first.before:,} {first.unit} would be left in {path}"
     why = "" if result.keeps_low_bits else ", as this format destroys low bits"
-    return f"{which} would be lost: {left}{why}; nothing was written; `force=True` writes it anyway"
+    formats = [name for name, suffix in SUFFIXES.items() if path.name.lower().endswith(suffix)]
+    cures = ['`publish="converted"`', *(f'`format="{name}"`' for name in formats)]
+    return (
+        f"{which} would be lost: {left}{why}; nothing was written; hide it with {' or '.join(cures)}, or "
+        "convert the model without it: `force=True`"
+    )

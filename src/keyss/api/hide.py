@@ -64,6 +64,7 @@ def hide(
     secrets: Sequence[Secret] | Sequence[SecretFile],
     *,
     method: str | MethodOptions = DEFAULT,
+    preset: str = "default",
     publish: Publish | None = None,
     views: ViewOptions = ViewOptions(),
     cover_model: PathLike | Gaussians | None = None,
@@ -80,7 +81,7 @@ def hide(
 
     Cover and secrets are scenes of photos, read as `views` says, or models of any format, which are rendered
     for measurements. Plain models of scenes are fitted unless they are given. `method`: a name, with the
-    default preset of the device, or the options of a method (`CarryOptions`, `KeyssOptions`).
+    options of a `preset` ("quick", "default" or "full"), or options (`CarryOptions`, `KeyssOptions`).
 
     `publish="unchanged"` is for a file that must stay as it is: secrets go into low bits of a .ply, or of the
     integers of a quantised format (the options' `format`). `publish="converted"` is for one that may be
@@ -107,7 +108,7 @@ def hide(
     `min_psnr`, `resume` and `views` are for scenes only.
     """
     began, target, reporter = time.monotonic(), resolve_device(device), reporter or default_reporter()
-    chosen, options = method_for(method, secrets, target.type)
+    chosen, options = method_for(method, preset, secrets, target.type)
     options = replace(options, publish=publish) if publish else options
     check_arguments(out, min_psnr)
     place = None if out is None else Path(out)

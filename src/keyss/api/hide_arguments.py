@@ -58,11 +58,14 @@ class HideResult:
 
 
 def method_for(
-    chosen: str | MethodOptions, secrets: Sequence[Secret] | Sequence[SecretFile], device: str
+    chosen: str | MethodOptions,
+    preset: str,
+    secrets: Sequence[Secret] | Sequence[SecretFile],
+    device: str,
 ) -> tuple[Method, MethodOptions]:
-    """A method and its options, by default its preset for the device.
+    """A method and its options, by default those of its `preset` for the device.
 
-    Raises UsageError if the method does not support these secrets or keys.
+    Raises UsageError if the method does not support these secrets or keys, and for a preset beside options.
     """
     if not isinstance(secrets, Sequence) or isinstance(secrets, str):
         raise UsageError("secrets: expected a list, such as [Secret(scene, key)]")
@@ -72,10 +75,12 @@ def method_for(
     if len(set(map(type, secrets))) > 1:
         raise UsageError("secrets: expected scenes or files, got both: hide them in two covers")
     if isinstance(chosen, MethodOptions):
+        if preset != "default":
+            raise UsageError(f'`preset="{preset}"` is for a method that is given by name, not by its options')
         method, options = registry.of_options(chosen), chosen
     else:
         method = registry.get(chosen)
-        options = method.options.preset("default", device)
+        options = method.options.preset(preset, device)
     if not 1 <= len(secrets) <= method.max_secrets:
         raise UsageError(
             f"expected 1 to {method.max_secrets} secrets for the method {method.name}, got {len(secrets)}"

@@ -74,7 +74,7 @@ def _check_sizes(channel: Channel, cover: Gaussians, payloads: Sequence[Payload]
         size = sum(compressed_size(payload.data) for payload in payloads)
     if size > _MOST * typical:
         raise UsageError(
-            f"the {channel.place} of a cover of {len(cover):,} Gaussians hold about {typical:,} bytes, and "
+            f"a cover of {len(cover):,} Gaussians holds about {typical:,} bytes in the {channel.place}, and "
             f"the given files take {size:,}"
         )
 

@@ -58,17 +58,18 @@ def check_quality(
     `models`: the stego model and the revealed ones. `resumes`: `resume` skips finished training.
     """
     again = ", and `resume=True` skips finished training" * resumes
+    joint = bool(prepared.training[0].steps)  # training cover and secrets together prunes none for capacity
     for index, (render, model, before) in enumerate(zip(shown, models, plain, strict=True)):
         fidelity = render.fidelity
         if fidelity is None or render.plain is None:
             continue
         who = "the cover" if index == 0 else "the secret" if len(shown) == 2 else f"secret {index}"
-        pruned = len(model) < before.gaussians
+        pruned = not joint and len(model) < before.gaussians
         kept = f" with {len(model):,} of {before.gaussians:,} Gaussians" if pruned else ""
         fact = f"{who}{kept} is at {fidelity.psnr:.2f} dB PSNR to its plain model"
-        cure = '; `publish="converted"` keeps all of them, and shows that there is a secret' * (
-            pruned and not prepared.survives
-        )
+        cure = "; more training steps (`iterations`) bring it nearer" * joint
+        if pruned and not prepared.survives:
+            cure = '; `publish="converted"` keeps all of them, and shows that there is a secret'
         least = _MIN_PRUNED_PSNR if pruned and not prepared.trains else _MIN_PSNR
         limit = least if min_psnr is None else min_psnr
         if fidelity.psnr < limit:

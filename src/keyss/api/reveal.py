@@ -96,7 +96,7 @@ def verify(
     target = resolve_device(device)
     name = "model" if isinstance(model, Gaussians) else str(model)
     gaussians = as_model(model)
-    secrets = []
+    checked, secrets = check_model(gaussians), []
     given = [keys] if isinstance(keys, str) else keys
     for number, key in enumerate(given, 1):
         with warnings.catch_warnings(record=True) as caught:
@@ -105,7 +105,8 @@ def verify(
                 revealed = reveal_secret(gaussians, key, target)
             except WrongKeyError as error:
                 which = f"key {number} of {len(given)}: " if len(given) > 1 else ""
-                raise WrongKeyError(f"{which}{error}") from error
+                state = "; ".join(checked.problems) or "sound"
+                raise WrongKeyError(f"{which}{error}; the model itself: {state}") from error
         problems = [str(warning.message) for warning in caught if issubclass(warning.category, KeyssWarning)]
         secrets.append(check_secret(revealed, problems))
-    return Verification(name, check_model(gaussians), tuple(secrets))
+    return Verification(name, checked, tuple(secrets))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -77,7 +78,7 @@ class Photos:
         optional(
             "R G B",
             "Background colour, 0 to 1 each; transparent photos are composited over it.",
-            "white for transparent photos, else black",
+            "white for transparent photos, else that of their edges if it is plain, else black",
         ),
     ] = None
     skip_missing: Annotated[
@@ -126,14 +127,15 @@ def flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def check_exists(*paths: Path | None) -> None:
+def check_exists(*paths: Path | None, keys: Sequence[Path] = ()) -> None:
     """Raise InputError if an input does not exist, UsageError if - is given twice. Does not import torch."""
-    names = [str(path) for path in paths if path is not None]
+    names = [str(path) for path in (*paths, *keys) if path is not None]
     if names.count(STANDARD) > 1:
         raise UsageError("- is given twice, and standard input holds one model or key: use files for others")
     for name in names:
         if name != STANDARD and not os.path.lexists(name):
-            raise InputError(f"{name} does not exist")
+            cure = "; `keyss keygen -o FILE` makes a key for a new secret" if Path(name) in keys else ""
+            raise InputError(f"{name} does not exist{cure}")
 
 
 def check_seed(seed: int) -> int:

@@ -96,8 +96,10 @@ def _run(arguments: list[str], options: set[str]) -> None:
     command = command_table.parse_target(name, rest)
     options.update(options_of(command))
     if "out" not in options and {"-o", "--out"} & {word.partition("=")[0] for word in rest}:
-        where = "name OUT after IN" if name == "convert" else "results go into the folder of the run, if any"
-        raise UsageError(f"`keyss {name}` has no option -o: {where}; see `keyss {name} --help`")
+        raise UsageError(
+            f"`keyss {name}` has no option -o: results go into the folder of the run, if any; see "
+            f"`keyss {name} --help`"
+        )
     if "--quick" in rest and "quick" not in options:
         for option, cure in _QUICKER.items():
             if option in options:

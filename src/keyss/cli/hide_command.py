@@ -141,7 +141,7 @@ def hide(args: HideArguments) -> None:
     """
     details = args.details
     secrets = (*args.secret, *args.secret_file, *details.secret_model)
-    check_exists(args.cover, details.cover_model, *secrets, *args.key_file)
+    check_exists(args.cover, details.cover_model, *secrets, keys=args.key_file)
     options = _method_options(args)
     if args.secret_file:
         if args.secret:

@@ -74,6 +74,7 @@ def fit(
     *,
     out: OutFolder,
     preset: Preset = "default",
+    dry_run: Annotated[bool, switch("Print estimates of time, memory and disk.")] = False,
     resume: Resume = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
@@ -88,18 +89,25 @@ def fit(
     from dataclasses import replace
 
     from keyss import progress
-    from keyss.cli.tables import print_files, print_fit
+    from keyss.cli.tables import print_cost, print_files, print_fit
 
     run = verb("fit")
     from keyss.fitting.config import preset_for
     from keyss.rendering import resolve_device
-    from keyss.runs.files import METRICS
+    from keyss.runs.files import METRICS, as_scene
     from keyss.runs.json_records import read_record
+    from keyss.runs.planning import cost_of_fit
     from keyss.runs.run_records import FitMetrics
 
+    target = resolve_device(device)
+    config = replace(preset_for(preset, target.type), **training.schedule())
+    if dry_run:
+        size = f"up to {config.max_gaussians:,} Gaussians of SH degree {config.sh_degree}"
+        print_cost(cost_of_fit(as_scene(scene, photos.views()), config, target), [("model", size)])
+        return
     run(
         scene,
-        config=replace(preset_for(preset, resolve_device(device).type), **training.schedule()),
+        config=config,
         views=photos.views(),
         device=device,
         out=out,
@@ -164,9 +172,12 @@ def keygen(
 
 
 def convert(
-    model: Annotated[Positional[Path], arg(metavar="IN", help="Model of any format, or - for stdin.")],
-    out: Annotated[Positional[Path], arg(metavar="OUT", help=f"Model to write ({known_suffixes()}).")],
+    model: Annotated[Positional[Path], arg(metavar="FILE", help="Model of any format, or - for stdin.")],
     *,
+    out: Annotated[
+        Path,
+        arg(metavar="FILE", help=f"Model to write ({known_suffixes()}), or - for stdout.", aliases=["-o"]),
+    ],
     key_file: KeyFilesToCheck = (),
     force: Annotated[bool, switch("Write the model even if a secret is lost.")] = False,
     dry_run: Annotated[bool, switch("Report the cost, and write nothing.")] = False,
@@ -175,14 +186,14 @@ def convert(
 ) -> None:
     """Convert a model to another format, and report the cost.
 
-    The suffix of OUT selects the format. All formats but .ply round values, which destroys what is hidden in
-    low bits, and most reorder Gaussians. The cost is the PSNR between renders before and after.
+    The suffix of --out selects the format. All formats but .ply round values, which destroys what is hidden
+    in low bits, and most reorder Gaussians. The cost is the PSNR between renders before and after.
 
-    example: keyss convert cover.ply cover.spz
+    example: keyss convert cover.ply -o cover.spz
 
-    example: keyss convert model.ply model.sog --key-file key.txt --dry-run
+    example: keyss convert model.ply -o model.sog --key-file key.txt --dry-run
     """
-    check_exists(model, *key_file)
+    check_exists(model, keys=key_file)
     import keyss
     from keyss.cli.tables import print_conversion
     from keyss.progress import waiting

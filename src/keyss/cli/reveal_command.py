@@ -48,7 +48,7 @@ def reveal(
 
     example: keyss reveal - --key-file key.txt -o - < model.ply > revealed.ply
     """
-    check_exists(stego, companion, *key_file)
+    check_exists(stego, companion, keys=key_file)
     if not is_standard(out):  # before a key is asked for and torch is imported
         check_not_an_input(out, [stego])
         check_output_file(out, overwrite)
@@ -93,7 +93,7 @@ def verify(
 
     example: keyss verify model.ply --key-file key.txt
     """
-    check_exists(model, *key_file)
+    check_exists(model, keys=key_file)
     import keyss
     from keyss.cli.tables import print_json, print_verification
     from keyss.progress import waiting

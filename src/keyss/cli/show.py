@@ -189,7 +189,7 @@ def evaluate(
 
     example: keyss evaluate runs/hidden --key-file key.txt
     """
-    check_exists(run, *key_file)
+    check_exists(run, keys=key_file)
     from keyss import progress
     from keyss.cli.tables import print_files, print_hiding
 

@@ -41,11 +41,11 @@ _HEADS = {
     "plain": "plain: Gaussians of the plain model",
     "steps": "steps: training steps",
 }
-# What `info` says of a number.
+# What `info` says of a number: {0} is its text, {1} the number.
 _MEANINGS = {
-    "bounding_box": "{}: two corners, in the model's units",
-    "nearly_transparent": "{} of the Gaussians, those with opacities below 0.05",
-    "extent": "{}: distance of the farthest camera from their middle plus a tenth, in the scene's units",
+    "bounding_box": "{0}: two corners, in the model's units",
+    "nearly_transparent": "{1:.0%} of the Gaussians, those with opacities below 0.05",
+    "extent": "{0}: distance of the farthest camera from their middle plus a tenth, in the scene's units",
 }
 _ROUNDED = 20 * math.log10(255 * math.sqrt(12))  # PSNR of the error of rounding to 8 bits
 _SHOWS = 1.0  # dB below the secret at which a wrong key shows as much
@@ -71,7 +71,9 @@ def print_hiding(metrics: HideMetrics, *, brief: bool = False) -> None:
     table = [[name, *(row.get(head, "") for head in heads)] for name, row in zip(first, rows, strict=True)]
     print_table([views, *heads], table)
     wrong_keys = [] if brief else _lines_on_wrong_keys(metrics, names)
-    rounded = "" if all(metrics.photos) else f" Equal renders, rounded to 8 bits, have {_ROUNDED:.2f} dB."
+    rounded = ""
+    if not all(metrics.photos):
+        rounded = f" Renders that differ only by rounding to 8 bits have {_ROUNDED:.0f} dB or more."
     lines = [_legend(heads) + rounded, *wrong_keys, *_lines_on_files(metrics, names)]
     if not brief:
         units = {"capacity": "Gaussians", "capacity_bytes": "bytes"}
@@ -118,22 +120,25 @@ def _quality(of: ImageQuality) -> dict[str, str]:
 
 
 def print_plan(method: str, plan: Plan, cost: Cost) -> None:
-    """Print capacity and estimates of a run."""
+    """Print capacity and estimates of a hiding."""
+    size = f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, {plan.megabytes:,.1f} MB"
+    rows = [("method", method), ("capacity", plan.room), ("published", size)]
+    print_cost(cost, rows, plan.notes)
+
+
+def print_cost(cost: Cost, rows: Sequence[tuple[str, str]] = (), notes: Iterable[str] = ()) -> None:
+    """Print estimates of a run, between `rows` and `notes` on it."""
     of = [f"{role_of(index, len(cost.steps))} {steps:,}" for index, steps in enumerate(cost.steps)]
-    training = [("training", f"steps: {', '.join(of)}")] if any(cost.steps) else []
+    if len(of) == 1:  # a fit has no roles
+        of = [f"{cost.steps[0]:,}"]
     print_columns(
         [
-            ("method", method),
-            ("capacity", plan.room),
-            (
-                "published",
-                f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, {plan.megabytes:,.1f} MB",
-            ),
-            *training,
+            *rows,
+            *([("training", f"steps: {', '.join(of)}")] if any(cost.steps) else []),
             ("time", f"about {about(cost.seconds)} on {cost.where}"),
             ("memory", f"about {cost.memory_bytes / 1e9:.1f} GB"),
             ("disk", f"up to {cost.disk_bytes / 1e6:,.0f} MB at once, checkpoints included"),
-            *(("note", note) for note in plan.notes),
+            *(("note", note) for note in notes),
         ]
     )
     print("Dry run: nothing was written. Times are rough.")
@@ -192,7 +197,7 @@ def print_info(described: RunInfo | InterruptedRun | ModelInfo | SceneInfo) -> N
         facts = {name: value for name, value in vars(described).items() if value is not None}
         capacity = facts.pop("capacity", ())
         rows = [
-            (name.replace("_", " "), _MEANINGS.get(name, "{}").format(_text(value)))
+            (name.replace("_", " "), _MEANINGS.get(name, "{0}").format(_text(value), value))
             for name, value in facts.items()
         ]
         print_columns([*rows, *(("capacity", line) for line in capacity)])

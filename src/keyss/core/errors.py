@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 OPENS_NOTHING = (
-    "this key opens nothing here: it may be another key or misspelt; the model may have changed since it was "
-    "published (converted or quantised, moved, scaled, pruned, edited, trained on or hidden in again); or "
-    "nothing is hidden"
+    "this key opens nothing here: it may be another key or misspelt; nothing may be hidden; or the model has "
+    "changed since it was published (converted or quantised, moved, scaled, pruned, edited, trained on or "
+    "hidden in again): try the file as it was published"
 )
 _PACKAGES = {"ot": "pot", "sklearn": "scikit-learn", "yaml": "pyyaml"}  # module: package, if the names differ
 MAX_LENGTH = 100  # characters of a misspelt name that count

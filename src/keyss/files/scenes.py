@@ -26,6 +26,8 @@ from keyss.files.transforms import read_blender, read_nerfstudio
 from keyss.kernels.memory import available_memory
 
 _ROUNDING = 1e-12  # relative error of a camera's position
+_PLAIN = 0.8  # share of the pixels at the photos' edges that have the colour of a plain background
+_NOISE = 8  # of a plain background, from 0 to 255
 _FAR = 1000  # extents from the origin, where single precision resolves 1e-4 extents
 _KNOWN = (
     "COLMAP (sparse/0/cameras.bin or .txt, images/); Blender / NeRF-synthetic (transforms_train.json); "
@@ -46,7 +48,7 @@ def load_scene(
     `width`: wider photos are undistorted, then downscaled to this width by area averaging, with K scaled per
     axis; photos are never enlarged.
     `background`: RGB in [0, 1], also under transparent pixels; by default white if any photo has an alpha
-    channel, else black.
+    channel, else the colour of four fifths of the pixels at the photos' edges, else black.
     `skip_missing`: leaves out photos that are missing on disk or have no usable camera, before test views are
     chosen, and damaged photos, with a KeyssWarning.
 
@@ -98,13 +100,13 @@ def load_scene(
     sizes = [(width, height) for _, (width, height, _) in probed]
     _check_memory(folder, sizes, width)
     photos = _fit_lenses(folder, [photo for photo, _ in probed], sizes)
-    if behind is None:
-        behind = torch.full((3,), float(any(transparent for _, (*_, transparent) in probed)))
+    transparent = any(transparent for _, (*_, transparent) in probed)
+    under = torch.ones(3) if behind is None else behind  # transparent pixels
     # Most scenes have one lens, and a map is as large as a photo.
     undistortions = functools.lru_cache(maxsize=2)(undistortion)
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
         decode = functools.partial(
-            _load_view, width=width, background=behind.numpy(), undistortions=undistortions, near=near
+            _load_view, width=width, background=under.numpy(), undistortions=undistortions, near=near
         )
         views = []
         for photo, pending in [(photo, pool.submit(decode, photo)) for photo in photos]:
@@ -115,6 +117,8 @@ def load_scene(
                     raise
                 damaged.append(photo.name)
     leave_out(folder, len(layout.train + layout.test), "cannot be read", damaged, skip_missing)
+    if behind is None:
+        behind = under if transparent else plain_background([(view.image, view.mask) for view in views])
     held_out = {photo.name for photo in layout.test}
     if shares := [float((~view.mask).float().mean()) for view in views if view.mask is not None]:
         warnings.warn(
@@ -132,6 +136,24 @@ def load_scene(
         background=behind,
         origin=torch.from_numpy(origin),
     )
+
+
+def plain_background(photos: Sequence[tuple[Tensor, Tensor | None]]) -> Tensor:
+    """[3] in [0, 1]: the colour around an object before a plain background, black if there is none.
+
+    `photos`: uint8 images [H, W, 3] and masks [H, W] of the pixels that count.
+    """
+    pixels = []
+    for image, mask in photos:
+        edges = torch.ones(image.shape[:2], dtype=torch.bool)
+        edges[1:-1, 1:-1] = False
+        pixels.append(image[edges if mask is None else edges & mask])
+    around = torch.cat(pixels).float()
+    if not len(around):
+        return torch.zeros(3)
+    colour = around.median(0).values
+    plain = ((around - colour).abs() <= _NOISE).all(1).float().mean() >= _PLAIN
+    return colour / 255 if plain else torch.zeros(3)
 
 
 def _check_memory(folder: Path, sizes: Sequence[tuple[int, int]], width: int | None) -> None:

@@ -1,8 +1,7 @@
 """Adam with a learning rate for each number of a row, in one pass over memory on a CPU.
 
 It updates all Gaussians, including those outside the view. Skipping these ("selective" Adam, Mallick et al.
-2024, "Taming 3DGS") costs quality and saves no time here, because memory accesses are no longer contiguous
-(docs/performance.md).
+2024, "Taming 3DGS") costs quality and saves no time here, because memory accesses are no longer contiguous.
 """
 
 from __future__ import annotations

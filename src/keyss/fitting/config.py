@@ -36,7 +36,7 @@ class FitConfig:
     boost: float | None = None
 
     # Last share of the run, in which all rates decay to a tenth: at constant rates, Gaussians jitter around
-    # their optimum. It helps only models that do not grow (docs/performance.md).
+    # their optimum. It helps only models that do not grow.
     settle: float = 0.0
 
     # First share of a growing run, in which large photos are shrunk, see `schedule.shrinking`; 0: never.

@@ -94,10 +94,14 @@ class CappedStrategy(DefaultStrategy):  # type: ignore[misc]
             state["grad2d"][refused] = 0
         return super()._grow_gs(params, optimizers, state, step)  # type: ignore[no-any-return]
 
-    @torch.no_grad()
     def _prune_gs(self, params: Parameters, optimizers: Optimizers, state: dict[str, Any], step: int) -> int:
         if self.freeze and len(params["means"]) >= self.max_gaussians:
             return 0
+        return self.prune(params, optimizers, state)
+
+    @torch.no_grad()
+    def prune(self, params: Parameters, optimizers: Optimizers, state: dict[str, Any]) -> int:
+        """Remove the Gaussians below the minimum opacity unless all are; returns their number."""
         visible = self.opacity_for_pruning or params["opacities"].sigmoid
         pruned = visible() < self.prune_opa
         count = int(pruned.sum())

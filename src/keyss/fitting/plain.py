@@ -77,6 +77,10 @@ class PlainRun(TrainingRun):
         image, meta = render_with_meta(model, camera, self.background, sh_degree=degree)
         target = self.targets.of(index, lambda: _target(view, size, self.device))
         self.optimise(photometric_loss(image, target, fit.ssim_weight), [(meta, None, 1.0)])
+        if self.grows and self.iteration == self.iterations:
+            # Gaussians become faint after density control has stopped. The original trainer leaves none
+            # either, so their absence does not reveal a secret.
+            self.strategy.prune(self.parameters, self.optimizers, self.density)
 
     def gaussians(self) -> Gaussians:
         return to_gaussians(self.parameters).detach()
@@ -96,9 +100,6 @@ def _target(view: View, size: tuple[int, int], device: torch.device) -> Target:
             shares = downscale(np.uint8(255) * mask.numpy(), *size)
             mask = torch.from_numpy(shares >= min(128, shares.max()))  # at least one pixel
     return Target.of(image.to(device), mask)
-
-
-_NOTED = 0.99  # share of the Gaussians that stay, below which a fit says so
 
 
 def fit_scene(
@@ -127,17 +128,4 @@ def fit_scene(
     run = PlainRun(scene, config, torch.device(device), model)
     fingerprint = {**inputs, "config": asdict(config)}
     train(run, title, fingerprint=fingerprint, checkpoint=checkpoint, resume=resume, reporter=reporter)
-    fitted = run.gaussians().to("cpu")
-    kept = without_faint(fitted, config.prune_opacity) if run.grows else fitted
-    if reporter is not None and len(kept) < _NOTED * len(fitted):
-        reporter.note(f"{title}: {len(fitted) - len(kept):,} Gaussians that became transparent are left out")
-    return FitResult(kept, config)
-
-
-def without_faint(model: Gaussians, min_opacity: float) -> Gaussians:
-    """Remove Gaussians below `min_opacity`, which fall below it after density control has stopped.
-
-    The original trainer leaves none either, so their absence does not reveal a secret.
-    """
-    kept = model.opacities >= min_opacity
-    return model[kept] if kept.any() else model
+    return FitResult(run.gaussians().to("cpu"), config)

@@ -59,7 +59,7 @@ def audit(
 
     example: keyss audit runs/hidden --key-file key.txt --only stealth --only leaks
     """
-    check_exists(run, *key_file)
+    check_exists(run, keys=key_file)
     measure = verb("audit")
     from keyss import progress
     from keyss.cli.keys import keys_of_run
@@ -75,7 +75,10 @@ def audit(
         print_table(
             ("part", "time, about"), [(name, progress.about(duration)) for name, duration in seconds.items()]
         )
-        print(f"About {progress.about(sum(seconds.values()))}; controls that exist take no time.")
+        print(
+            f"About {progress.about(sum(seconds.values()))}; controls are plain models of the cover, for "
+            "comparison; they are fitted once."
+        )
         print("Dry run: nothing was written. Times are rough.")
         return
     from keyss.lab.audits import headline

@@ -199,14 +199,15 @@ def _capacities(model: Gaussians) -> Iterator[str]:
     ]
     for flags, (publish, channel, format) in ways:
         try:
-            room = channel_for(publish, channel, format, model).prepare(model).capacity
+            used = channel_for(publish, channel, format, model)
+            room = used.prepare(model).capacity
         except UsageError as error:
             yield f"{flags}: nothing ({error})"
             continue
         sizes = (
             f"{room.bytes // size:,} Gaussians of SH degree {n}" for n, size in _BYTES_PER_GAUSSIAN.items()
         )
-        yield f"{flags}: {room.bytes:,} bytes, a model of about {' or '.join(sizes)}"
+        yield f"{flags}: {room.bytes:,} bytes in {used.place}, a model of about {' or '.join(sizes)}"
     yield f"--publish converted: {APPENDED.estimate_capacity(0, 0).bytes:,} bytes; the file grows"
 
 

@@ -49,6 +49,12 @@ def stego_in(folder: Path) -> Path:
     return folder / next((name for name in STEGOS if os.path.isfile(folder / name)), STEGO)
 
 
+def is_published(model: Path) -> bool:
+    """True for the published file of a run that is still beside it."""
+    folder = Path(os.path.realpath(model)).parent
+    return folder.name == PUBLISH and os.path.isfile(folder.parent / MANIFEST)
+
+
 def run_folder(path: Path) -> Path:
     """`path`, if it is the folder of a hiding.
 

@@ -6,14 +6,16 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+import msgspec
+import numpy as np
 import torch
 from torch import Tensor
 
 from keyss.core.errors import InputError
-from keyss.core.scene import Camera, camera_axes, camera_positions, focus_point
+from keyss.core.scene import Camera, ViewOptions, camera_axes, camera_positions, focus_point
 from keyss.core.similarity import up_direction
-from keyss.files.images import probe_image
-from keyss.files.scenes import origin_and_extent, read_layout, recentre
+from keyss.files.images import probe_image, read_image
+from keyss.files.scenes import origin_and_extent, plain_background, read_layout, recentre
 from keyss.runs.files import CONFIG, is_run
 
 # Keys: `pose`, as in the page's address ("eye=X,Y,Z&target=X,Y,Z", with "&up=z" or "&up=X,Y,Z", and
@@ -32,17 +34,24 @@ def look_of_model(model: Path) -> Look:
     run = next((parent for parent in model.absolute().parents[:2] if is_run(parent)), None)
     try:
         config = json.loads((run / CONFIG).read_bytes()) if run else {}
-        return look_of_scene(Path(config.get("cover") or config.get("scene") or ""))
+        views = msgspec.convert(config.get("views") or {}, ViewOptions)
+        return look_of_scene(Path(config.get("cover") or config.get("scene") or ""), views.background)
     except (OSError, ValueError):
         return {}
 
 
-def look_of_scene(scene: Path) -> Look:
-    """The first test photo, whole and upright; empty if the path is not a scene."""
+def look_of_scene(scene: Path, background: Sequence[float] | None = None) -> Look:
+    """The first test photo, whole and upright; empty if the path is not a scene.
+
+    `background`: [3] in [0, 1], by default that of the photo.
+    """
     try:
         layout = read_layout(scene, skip_missing=True)
         photo = sorted(layout.test or layout.train, key=lambda photo: photo.name)[0]
-        width, height, is_white = probe_image(photo.path)
+        width, height, is_transparent = probe_image(photo.path)
+        if background is None and not is_transparent:
+            pixels = read_image(photo.path, np.zeros(3, np.float32))
+            background = plain_background([(torch.from_numpy(pixels), None)]).tolist()
     except InputError:
         return {}
     lens = photo.lens.scale_to(width, height) or photo.lens
@@ -57,7 +66,8 @@ def look_of_scene(scene: Path) -> Look:
         )
         for view in (photo, *layout.train)
     )
-    return {"pose": pose_of(shown, cameras), "background": "#ffffff" if is_white else "#000000"}
+    colour = "".join(f"{round(255 * value):02x}" for value in background or (1, 1, 1))
+    return {"pose": pose_of(shown, cameras), "background": f"#{colour}"}
 
 
 def pose_of(camera: Camera, cameras: Sequence[Camera]) -> str:

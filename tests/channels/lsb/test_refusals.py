@@ -46,7 +46,7 @@ def test_files_that_no_cover_of_the_size_holds_are_refused_unseen(
     monkeypatch.setattr(type(place), "prepare", lambda *_: pytest.fail("the cover is examined"))
     secret = SecretFile(os.urandom(4_000_000), "7Vw3-Qp: a key for a test", "noise")
     options = CarryOptions(publish=publish, channel=channel)  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match="of a cover of 20,000 Gaussians hold about"):
+    with pytest.raises(UsageError, match="a cover of 20,000 Gaussians holds about"):
         hide(cover, [secret], method=options)
     with pytest.raises(pytest.fail.Exception, match="the cover is examined"):  # its zeros compress
         hide(cover, [SecretFile(bytes(1_000_000), secret.key, "zeros")], method=options)

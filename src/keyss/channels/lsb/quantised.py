@@ -58,7 +58,7 @@ class QuantisedChannel(Channel):
         self.format, self.decoded = format, decoded
         self.place = f"quantised values of {format}"
         if decoded:
-            self.place = f"quantised values of {format} from which it was decoded"
+            self.place = f"values of the {format} file that the cover was decoded from"
 
     def prepare(self, cover: Gaussians) -> QuantisedCover:
         """See `Channel`. A model that was read from a file of this format keeps its values.

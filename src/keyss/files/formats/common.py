@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from keyss.core.arrays import Bytes, Doubles, Floats, Integers, Numbers, Words
-from keyss.core.errors import InputError, KeyssWarning, OutputError
+from keyss.core.errors import InputError, KeyssWarning, OutputError, not_whole
 from keyss.core.gaussians import SH_C0, Gaussians
 from keyss.files.ply_table import OPACITY_LOGIT_BOUND
 from keyss.kernels.parallel import in_blocks
@@ -116,7 +116,7 @@ def check_count(count: int, size: int, least: float = MIN_BYTES) -> None:
     if count < 1:
         raise InputError("it holds no Gaussians")
     if count > max(SMALL_COUNT, size / least):
-        raise InputError(f"it announces {count:,} Gaussians, more than {size:,} bytes hold")
+        raise not_whole("model", f"it announces {count:,} Gaussians, more than {size:,} bytes hold")
 
 
 def check_sh_degree(degree: int) -> int:
