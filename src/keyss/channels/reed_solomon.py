@@ -89,7 +89,7 @@ class Codewords:
             if errors:
                 self._drop_errors(rows, shards)
             if ((rows >= 0).sum(axis=0) >= self.k).all():
-                data: Bytes = shards[rows[: self.k]]
+                data: Bytes = shards.take(rows[: self.k], axis=0)
                 _restore(shards, rows, data)
                 return data.reshape(-1).data
         raise InputError(f"{LOST}: {len(np.unique(places)):,} of {self.shards:,} shards are left")

@@ -56,7 +56,7 @@ class Steps:
         self.others = np.full((len(means), 2 + near), _ZERO, np.int32)  # candidates for siblings
         self.others[:, 1] = _COLOURS
         if near:
-            means = means[self.order]
+            means = means.take(self.order, axis=0)
             tree = Neighbours(means, near + 1)
 
             def search(start: int, stop: int) -> None:
@@ -83,7 +83,7 @@ class Steps:
 
         def mark(start: int, stop: int) -> None:
             block = rows[start:stop]
-            _mark(block, self.others[block], *self.words, depth, moved)
+            _mark(block, self.others.take(block, axis=0), *self.words, depth, moved)
 
         in_blocks(mark, len(rows), _ROWS, _mark)
         _mark(distant[0], distant[1, :, None].astype(np.int32), *self.words, depth, moved)

@@ -170,12 +170,13 @@ class Writer:
             for data_key, (_, payload), share in zip(data_keys, payloads, plan.shares, strict=False):
                 chosen, left = left[: share.carriers], left[share.carriers :]
                 shards = Shards(data_key, share.codewords, is_tagged(noise.shape[1]))
-                if (numbers := shards.numbers(self.ids[chosen])) is None:
+                ids = self.ids.take(chosen, axis=0)
+                if (numbers := shards.numbers(ids)) is None:
                     break
                 record = exact_record(data_key, self.ids)
                 sealed = container.seal(data_key, payload, share.codewords.size, record)
-                contents = share.codewords.encode(sealed)[numbers]
-                bodies.append((plan.depth, chosen, shards.encrypt(self.ids[chosen], numbers, contents)))
+                contents = share.codewords.encode(sealed).take(numbers, axis=0)
+                bodies.append((plan.depth, chosen, shards.encrypt(ids, numbers, contents)))
             else:
                 return [(plan.depth, rows, noise), *headers, *bodies]
         raise AssertionError

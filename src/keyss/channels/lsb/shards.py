@@ -162,7 +162,7 @@ class Shards:
         if self.tagged:
             fits &= low[:, 0] == tags
         rows, left = np.flatnonzero(fits), low[:, at + _NUMBER_BYTES :]
-        data = function(self.data_key, "shard/pad", ids[rows], self.codewords.width)
+        data = function(self.data_key, "shard/pad", ids.take(rows, axis=0), self.codewords.width)
         for start in range(0, len(rows), _ROWS):  # a copy of all takes memory
             data[start : start + _ROWS] ^= left[rows[start : start + _ROWS], : self.codewords.width]
         return fits, self._number(group[fits], local[fits].astype(np.int64)), data
