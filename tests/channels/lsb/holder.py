@@ -38,7 +38,7 @@ def _opened(stego: Gaussians, key: DerivedKey) -> tuple[Payload, list[int], npt.
     def read_message(self: Message, ids: Any, low: Any) -> bytes:
         data = read(self, ids, low)
         rows, contents = self.write(ids, data)
-        messages.append(int((low[rows, : self.width] == contents).all(axis=1).sum()))
+        messages.append(int((low(rows)[:, : self.width] == contents).all(axis=1).sum()))
         return data
 
     def decrypt_shards(self: Shards, ids: Any, low: Any) -> Any:

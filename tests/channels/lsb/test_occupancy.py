@@ -34,11 +34,11 @@ def _seen(sizes: Sequence[int]) -> list[float]:
     for _, rows, data in writer.write(list(zip(KEYS, payloads, strict=False))):
         low[rows, : data.shape[1]] = data
     message = key_message(key_secret(KEYS[0][0]), low.shape[1])
-    data_key = message.read(IDS, low)
+    data_key = message.read(IDS, low.__getitem__)
     places, contents = message.write(IDS, data_key)
     own_key = (low[places, :16] == contents).all(axis=1)
     message = parameter_message(data_key, low.shape[1])
-    packed = message.read(IDS, low)
+    packed = message.read(IDS, low.__getitem__)
     places, contents = message.write(IDS, packed)
     own_parameters = (low[places, : contents.shape[1]] == contents).all(axis=1)
     found = Parameters.unpack(packed, data_key)

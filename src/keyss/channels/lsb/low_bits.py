@@ -218,25 +218,26 @@ class LowBitsReader(SaltedReader):
 
     stego: Gaussians
     ids: Bytes  # [N, 16]
-    low: Bytes  # [N, B] at the least depth
     salts: Sequence[bytes]
     layout: Layout
 
     @staticmethod
     def of(stego: Gaussians) -> LowBitsReader:
         layout = Layout.of(stego)
-        ids, low = gaussian_ids(stego, layout), read_low_bits(stego, LEAST, layout)
+        ids = gaussian_ids(stego, layout)
         rows = _unique_rows(stego, ids, layout)
         if len(rows) < len(ids):
-            stego, ids, low = stego[torch.from_numpy(rows)], ids[rows], low[rows]
-        salts = [salt(ids[row], low[row]) for row in salt_rows(stego, ids, layout)]
-        return LowBitsReader(stego, ids, low, salts, layout)
+            stego, ids = stego[torch.from_numpy(rows)], ids[rows]
+        rows = salt_rows(stego, ids, layout)
+        low = read_low_bits(stego[torch.from_numpy(rows)], LEAST, layout)
+        salts = [salt(*carrier) for carrier in zip(ids[rows], low, strict=True)]
+        return LowBitsReader(stego, ids, salts, layout)
 
     def extract(self, key: DerivedKey) -> Payload:
         """See `SaltedReader`. A wrong key makes all passes with a data key that matches nothing."""
         width = self.layout.width(LEAST)
-        data_key = key_message(container.key_secret(key), width).read(self.ids, self.low)
-        packed = parameter_message(data_key, width).read(self.ids, self.low)
+        data_key = key_message(container.key_secret(key), width).read(self.ids, self._low)
+        packed = parameter_message(data_key, width).read(self.ids, self._low)
         parameters = container.Parameters.unpack(packed, data_key)
         if parameters is None:
             none = Codewords(1, 1, 1, shard_bytes(self.layout.width(DEEPEST)))
@@ -250,6 +251,10 @@ class LowBitsReader(SaltedReader):
             shards=(int((np.bincount(numbers) > 0).sum()), codewords.shards),
             foreign=exact_foreign(record, data_key, self.ids),
         )
+
+    def _low(self, rows: Integers) -> Bytes:
+        """[R, B] low bits at the least depth."""
+        return read_low_bits(self.stego[torch.from_numpy(rows)], LEAST, self.layout)
 
     def _shards(self, data_key: bytes, codewords: Codewords, depth: int) -> tuple[Integers, Bytes]:
         """Numbers and data of all shards that seem to be there."""

@@ -18,7 +18,7 @@ errors, which the code corrects.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,12 +89,12 @@ class Message:
         contents = np.repeat(every.reshape(-1, self.width), [len(rows) for rows in places], axis=0)
         return rows, contents ^ pads
 
-    def read(self, ids: Bytes, low: Bytes) -> bytes:
-        """The most frequent content of each fragment in `low` [N, width or more]."""
+    def read(self, ids: Bytes, low: Callable[[Integers], Bytes]) -> bytes:
+        """The most frequent content of each fragment; `low`: the low bits [R, width or more] of rows [R]."""
         message = b""
         for rows in self._candidates(ids):
             pads = function(self.secret, f"{self.label}/pad", ids[rows], self.width)
-            contents, times = np.unique(low[rows, : self.width] ^ pads, axis=0, return_counts=True)
+            contents, times = np.unique(low(rows)[:, : self.width] ^ pads, axis=0, return_counts=True)
             message += contents[times.argmax()].tobytes() if len(rows) else bytes(self.width)
         return message[: self.size]
 
