@@ -239,10 +239,8 @@ def print_conversion(out: Path, conversion: Conversion, *, dry_run: bool) -> Non
     renders = "renders the same" if conversion.psnr >= 120 else f"renders at {conversion.psnr:.1f} dB PSNR"
     if math.isnan(conversion.psnr):
         renders = "renders are empty: the model is invisible"
-    print(
-        f"{out}: {len(conversion.gaussians):,} Gaussians, {_size(conversion.bytes_after)}{was}, {renders}",
-        file=file,
-    )
+    size = f"{_size(conversion.bytes_after)}{was}"
+    print(f"{_name(out)}: {len(conversion.gaussians):,} Gaussians, {size}, {renders}", file=file)
     for number, secret in enumerate(conversion.secrets, 1):
         which = "the secret" if len(conversion.secrets) == 1 else f"the secret of key {number}"
         state = "survives" if secret.kept else f"is lost: {secret.after:,} {secret.unit} are left"
@@ -275,9 +273,13 @@ def print_files(folder: Path, names: Mapping[str, str]) -> None:
 def print_written(path: Path, text: str) -> None:
     """Print the path and the description of one result, to the standard error stream if it went to stdout."""
     print(
-        path if progress.level < 0 else f"{path}: {text}",
+        path if progress.level < 0 else f"{_name(path)}: {text}",
         file=sys.stderr if is_standard(path) else sys.stdout,
     )
+
+
+def _name(path: Path) -> str:
+    return "standard output" if is_standard(path) else str(path)
 
 
 def print_columns(rows: Sequence[tuple[str, str]]) -> None:

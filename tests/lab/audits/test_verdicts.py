@@ -64,18 +64,21 @@ def test_the_worst_leak_decides(leak: tuple[float, float, float], word: str) -> 
 
 
 @pytest.mark.parametrize(
-    ("least", "of_controls", "word"),
+    ("least", "of_controls", "of_original", "word"),
     [
-        (0.2, 0.5, "fine"),
-        (0.01, 0.5, "fine"),
-        (0.009, 0.5, "visible"),
-        (0.2, 1e-10, "inconclusive"),  # plain models fail too: the test finds anything, or nothing
-        (0.0, 1e-10, "inconclusive"),
+        (0.2, 0.5, 0.5, "fine"),
+        (0.01, 0.5, 0.5, "fine"),
+        (0.009, 0.5, 0.5, "visible"),
+        (0.2, 1e-10, 0.5, "inconclusive"),  # plain models fail too: the test finds anything, or nothing
+        (0.0, 1e-10, 0.5, "inconclusive"),
+        (1e-40, 0.5, 1e-55, "inconclusive"),  # a given cover of another trainer
     ],
 )
-def test_controls_that_fail_decide_nothing(least: float, of_controls: float, word: str) -> None:
+def test_plain_models_that_fail_decide_nothing(
+    least: float, of_controls: float, of_original: float, word: str
+) -> None:
     statistic = JudgedStatistic("bits: ones", 0.5, 0.4, 0.6, least, None)
-    (verdict,) = stealth_verdicts(StealthResult((statistic,), least, of_controls))
+    (verdict,) = stealth_verdicts(StealthResult((statistic,), least, of_controls, of_original))
     assert verdict.word == word
     assert stealth_verdicts(StealthResult((), 1.0, 1.0)) == []
 
