@@ -122,10 +122,10 @@ def test_pruning() -> None:
 def test_the_headline() -> None:
     assert headline([]) == "No part that was measured has a limit."
     fine = Verdict("leaks", "0 dB", "", "", "fine")
-    assert headline([fine, fine]) == "Within their limits: 2 of 2 measures."
+    assert headline([fine, fine]) == "Fine: 2 of 2 measures."
     lines = [
         fine,
         replace(fine, measure="renders", word="visible"),
         replace(fine, measure="file", word="inconclusive"),
     ]
-    assert headline(lines) == "Within their limits: 1 of 3 measures. Visible: renders. Inconclusive: file."
+    assert headline(lines) == "Fine: 1 of 3 measures. Visible: renders. Inconclusive: file."
