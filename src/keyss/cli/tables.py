@@ -49,6 +49,7 @@ _MEANINGS = {
 }
 _ROUNDED = 20 * math.log10(255 * math.sqrt(12))  # PSNR of the error of rounding to 8 bits
 _SHOWS = 1.0  # dB below the secret at which a wrong key shows as much
+_HARMS = 2.0  # dB that wrong keys may cost the cover
 
 
 class Console(RichConsole):
@@ -153,11 +154,13 @@ def _lines_on_wrong_keys(metrics: HideMetrics, names: Sequence[str]) -> list[str
     cover = f"{wrong.vs_cover.mean:.2f} to the cover, at least {wrong.vs_cover.min:.2f}"
     chance = ", ".join(f"{psnr:.2f}" for psnr in metrics.chance_level)
     scenes = zip(names[1:], wrong.vs_secrets, metrics.secrets, strict=True)
+    cost = metrics.cover.psnr - wrong.vs_cover.mean
     unlearnt = [name for name, psnrs, quality in scenes if psnrs.max > quality.psnr - _SHOWS]
     return [
         f"PSNR of {wrong.keys} wrong keys: on average {cover}; at most {highest}.",
         f"Chance level: {chance}, the published model's PSNR to the secret; `keyss audit` judges by it.",
         *(f"Wrong keys show as much of the {name} as its key: train longer." for name in unlearnt),
+        *([f"Wrong keys cost the cover {cost:.1f} dB: train longer."] if cost > _HARMS else []),
     ]
 
 
