@@ -99,6 +99,9 @@ def test_usage_errors(keyss: Run, arguments: tuple[str, ...]) -> None:
         (("frobnicate",), "see `keyss --help`"),
         (("audit", "run", "-o", "x"), "results go into the folder of the run"),
         (("audit", "run", "--quick"), "--only PART"),
+        (("hide", "--preset", "quik"), "--preset: expected one of quick, default, full, got 'quik'"),
+        (("hide", "--format", "splat"), "expected one of ply, spz, sog, compressed-ply, got"),
+        (("hide", "--fine-tune", "no"), "expected one of auto, always, never"),
         (("hide", "--cover", "a", "--secret", "b", "-o", "c", "--quick"), "give --preset quick"),
     ],
 )

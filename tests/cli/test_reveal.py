@@ -158,7 +158,7 @@ def program(*arguments: object, data: bytes = b"", **more: str) -> tuple[int, by
 def test_pipes(files: Path, tmp_path: Path) -> None:
     data = (files / "whole.ply").read_bytes()
     status, out, err = program("reveal", "-", "-o", "-", data=data, KEYSS_KEY=KEY)
-    assert (status, err.splitlines()[-1]) == (0, "-: 500 of 500 Gaussians")
+    assert (status, err.splitlines()[-1]) == (0, "standard output: 500 of 500 Gaussians")
     (tmp_path / "s.ply").write_bytes(out)
     assert len(read_model(tmp_path / "s.ply")) == 500
     status, out, err = program("info", "-", "--json", data=out)

@@ -102,6 +102,14 @@ def test_secrets_that_no_key_shows(highest: float, unlearnt: bool) -> None:
     assert (["Wrong keys show as much of the secret as its key: train longer."] in rows) == unlearnt
 
 
+@pytest.mark.parametrize(("mean", "harmed"), [(20.0, True), (29.0, False)])
+def test_wrong_keys_that_harm_the_cover(mean: float, harmed: bool) -> None:
+    wrong = WrongKeys(2, PsnrRange(mean, 19, 30), (PsnrRange(11, 10, 12),))
+    cover = replace(METRICS.cover, psnr=30.0)
+    rows = table(replace(METRICS, cover=cover, wrong_key=wrong, chance_level=(10.0,)))
+    assert (["Wrong keys cost the cover 10.0 dB: train longer."] in rows) == harmed
+
+
 def test_renders_of_models_are_rounded() -> None:
     """The error of rounding is 58.92 dB, and less where pixels are black or white."""
     renders = table(replace(METRICS, photos=(False, False)))

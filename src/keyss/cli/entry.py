@@ -11,7 +11,9 @@ import warnings
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import is_dataclass
-from typing import Any, get_type_hints
+from itertools import pairwise
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from keyss import __version__
 from keyss.core.errors import (
@@ -46,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     KEYSS_DEBUG=1 in the environment, internal errors are raised.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    options: set[str] = set()  # options of the command, by their names in Python
+    options: dict[str, Any] = {}  # options of the command, by their names in Python
     try:
         with _warnings_as_lines(options), _verbosity(arguments) as words:
             try:
@@ -66,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return status
 
 
-def _run(arguments: list[str], options: set[str]) -> None:
+def _run(arguments: list[str], options: dict[str, Any]) -> None:
     """Run the command that `arguments` name; its options are added to `options`."""
     name, *rest = arguments
     if arguments in (["--version"], ["-V"]):  # needs no argument parser, whose import is slow
@@ -104,6 +106,10 @@ def _run(arguments: list[str], options: set[str]) -> None:
         for option, cure in _QUICKER.items():
             if option in options:
                 raise UsageError(f"`keyss {name}` has no option --quick: {cure}")
+    for word, value in pairwise(rest):
+        choices = _choices(options.get(word.removeprefix("--").replace("-", "_")))
+        if choices and word.startswith("--") and value not in choices:
+            raise UsageError(f"{word}: expected one of {', '.join(choices)}, got {value!r}")
     known = {"--help", *map(flag, options)}
     for given in (word.partition("=")[0].replace("_", "-") for word in rest):
         if given.startswith("--") and given not in known and (near := nearest(given, known)):
@@ -239,6 +245,17 @@ def as_flags(message: str, options: Collection[str]) -> str:
         return " ".join(words)
 
     return re.sub("`([^`]*)`", flags, message)
+
+
+def _choices(hint: Any) -> list[str]:
+    """The values of an option that has a few; empty for any other."""
+    if get_origin(hint) is Annotated:
+        return _choices(hint.__origin__)
+    if get_origin(hint) is Literal:
+        return [str(value) for value in get_args(hint)]
+    if get_origin(hint) in (Union, UnionType):
+        return [value for part in get_args(hint) for value in _choices(part)]
+    return []
 
 
 def options_of(command: Any) -> dict[str, Any]:

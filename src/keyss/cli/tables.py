@@ -49,6 +49,7 @@ _MEANINGS = {
 }
 _ROUNDED = 20 * math.log10(255 * math.sqrt(12))  # PSNR of the error of rounding to 8 bits
 _SHOWS = 1.0  # dB below the secret at which a wrong key shows as much
+_HARMS = 2.0  # dB that wrong keys may cost the cover
 
 
 class Console(RichConsole):
@@ -153,11 +154,13 @@ def _lines_on_wrong_keys(metrics: HideMetrics, names: Sequence[str]) -> list[str
     cover = f"{wrong.vs_cover.mean:.2f} to the cover, at least {wrong.vs_cover.min:.2f}"
     chance = ", ".join(f"{psnr:.2f}" for psnr in metrics.chance_level)
     scenes = zip(names[1:], wrong.vs_secrets, metrics.secrets, strict=True)
+    cost = metrics.cover.psnr - wrong.vs_cover.mean
     unlearnt = [name for name, psnrs, quality in scenes if psnrs.max > quality.psnr - _SHOWS]
     return [
         f"PSNR of {wrong.keys} wrong keys: on average {cover}; at most {highest}.",
         f"Chance level: {chance}, the published model's PSNR to the secret; `keyss audit` judges by it.",
         *(f"Wrong keys show as much of the {name} as its key: train longer." for name in unlearnt),
+        *([f"Wrong keys cost the cover {cost:.1f} dB: train longer."] if cost > _HARMS else []),
     ]
 
 
@@ -239,10 +242,8 @@ def print_conversion(out: Path, conversion: Conversion, *, dry_run: bool) -> Non
     renders = "renders the same" if conversion.psnr >= 120 else f"renders at {conversion.psnr:.1f} dB PSNR"
     if math.isnan(conversion.psnr):
         renders = "renders are empty: the model is invisible"
-    print(
-        f"{out}: {len(conversion.gaussians):,} Gaussians, {_size(conversion.bytes_after)}{was}, {renders}",
-        file=file,
-    )
+    size = f"{_size(conversion.bytes_after)}{was}"
+    print(f"{_name(out)}: {len(conversion.gaussians):,} Gaussians, {size}, {renders}", file=file)
     for number, secret in enumerate(conversion.secrets, 1):
         which = "the secret" if len(conversion.secrets) == 1 else f"the secret of key {number}"
         state = "survives" if secret.kept else f"is lost: {secret.after:,} {secret.unit} are left"
@@ -275,9 +276,13 @@ def print_files(folder: Path, names: Mapping[str, str]) -> None:
 def print_written(path: Path, text: str) -> None:
     """Print the path and the description of one result, to the standard error stream if it went to stdout."""
     print(
-        path if progress.level < 0 else f"{path}: {text}",
+        path if progress.level < 0 else f"{_name(path)}: {text}",
         file=sys.stderr if is_standard(path) else sys.stdout,
     )
+
+
+def _name(path: Path) -> str:
+    return "standard output" if is_standard(path) else str(path)
 
 
 def print_columns(rows: Sequence[tuple[str, str]]) -> None:

@@ -43,7 +43,12 @@ def audit(
     ] = 3,
     only: Annotated[
         UseAppendAction[tuple[str, ...]],
-        optional("PART", "Part to audit, of those that --dry-run lists; repeat for more.", "all"),
+        optional(
+            "PART",
+            "Part to audit: images, parameters, stealth, stegexpose, leaks, robustness or speed; repeat for "
+            "more.",
+            "all",
+        ),
     ] = (),
     dry_run: Annotated[bool, switch("Print estimates of the time of each part; needs no keys.")] = False,
     resume: Resume = False,
@@ -71,7 +76,7 @@ def audit(
         from keyss.runs.files import stego_in
 
         with progress.waiting("reading the scenes", seconds_for("prepare", stego_in(run))):
-            seconds = forecast_audit(run, controls=controls, only=only, device=device)
+            seconds = forecast_audit(run, controls=controls, only=only, seed=seed, device=device)
         print_table(
             ("part", "time, about"), [(name, progress.about(duration)) for name, duration in seconds.items()]
         )

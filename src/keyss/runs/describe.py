@@ -18,7 +18,7 @@ from keyss.files.inputs import is_standard
 from keyss.files.ply_summary import NEARLY_TRANSPARENT, summarise_ply
 
 # Of a hidden model, by SH degree: `usual_size` of six models is 14 to 17, and 10 to 12.
-_BYTES_PER_GAUSSIAN = {3: 17, 0: 11}
+_BYTES_PER_GAUSSIAN = {3: 17, 0: 12}
 
 if TYPE_CHECKING:
     from keyss.core.gaussians import Gaussians

@@ -51,7 +51,9 @@ class ModelServer:
             kind = _ServerIPv6 if ":" in host else ThreadingHTTPServer
             self._server = kind((host, port), BaseHTTPRequestHandler)
         except (OSError, OverflowError) as error:
-            raise OutputError(f"cannot serve on {host}, port {port}: {error}") from error
+            reason = getattr(error, "strerror", None) or error
+            cure = "leave out `port` for any free one"
+            raise OutputError(f"cannot serve on {host}, port {port}: {reason}; {cure}") from error
         self._server.daemon_threads = True
         self._ip = ipaddress.ip_address(str(self._server.server_address[0]))
         # Accepted `Host` headers; None accepts all, if the server listens on all addresses.

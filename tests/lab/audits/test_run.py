@@ -20,6 +20,9 @@ from keyss.files import read_model
 from keyss.lab import measure_render_time, render_time
 from keyss.lab.audits import PARTS, Section, audit, read_audit
 from keyss.lab.audits.audit_run import forecast_audit
+from keyss.lab.audits.subject import control_name
+from keyss.runs.files import CONFIG, CONTROLS
+from keyss.runs.run_records import read_config
 from lab.audits.audited import KEYS
 from test_api import ANY, write_nerfstudio
 from tiny_scenes import random_gaussians, tiny_scene
@@ -165,5 +168,12 @@ def test_forecast(run: Path) -> None:
     assert list(more) == ["controls", "stealth", "speed"]
     assert more["controls"] == pytest.approx(2 * found["controls"])
     assert more["speed"] == found["speed"]
+    seed = read_config(run / CONFIG).options.fit.seed_of("control 0")
+    (run / CONTROLS).mkdir()
+    control = run / CONTROLS / control_name(seed, "0123")
+    control.touch()
+    assert forecast_audit(run)["controls"] == pytest.approx(found["controls"] * 2 / 3)
+    control.unlink()
+    (run / CONTROLS).rmdir()
     with pytest.raises(UsageError, match="no such part"):
         forecast_audit(run, only=("sorcery",))

@@ -64,18 +64,21 @@ def test_the_worst_leak_decides(leak: tuple[float, float, float], word: str) -> 
 
 
 @pytest.mark.parametrize(
-    ("least", "of_controls", "word"),
+    ("least", "of_controls", "of_original", "word"),
     [
-        (0.2, 0.5, "fine"),
-        (0.01, 0.5, "fine"),
-        (0.009, 0.5, "visible"),
-        (0.2, 1e-10, "inconclusive"),  # plain models fail too: the test finds anything, or nothing
-        (0.0, 1e-10, "inconclusive"),
+        (0.2, 0.5, 0.5, "fine"),
+        (0.01, 0.5, 0.5, "fine"),
+        (0.009, 0.5, 0.5, "visible"),
+        (0.2, 1e-10, 0.5, "inconclusive"),  # plain models fail too: the test finds anything, or nothing
+        (0.0, 1e-10, 0.5, "inconclusive"),
+        (1e-40, 0.5, 1e-55, "inconclusive"),  # a given cover of another trainer
     ],
 )
-def test_controls_that_fail_decide_nothing(least: float, of_controls: float, word: str) -> None:
+def test_plain_models_that_fail_decide_nothing(
+    least: float, of_controls: float, of_original: float, word: str
+) -> None:
     statistic = JudgedStatistic("bits: ones", 0.5, 0.4, 0.6, least, None)
-    (verdict,) = stealth_verdicts(StealthResult((statistic,), least, of_controls))
+    (verdict,) = stealth_verdicts(StealthResult((statistic,), least, of_controls, of_original))
     assert verdict.word == word
     assert stealth_verdicts(StealthResult((), 1.0, 1.0)) == []
 
@@ -119,10 +122,10 @@ def test_pruning() -> None:
 def test_the_headline() -> None:
     assert headline([]) == "No part that was measured has a limit."
     fine = Verdict("leaks", "0 dB", "", "", "fine")
-    assert headline([fine, fine]) == "Within their limits: 2 of 2 measures."
+    assert headline([fine, fine]) == "Fine: 2 of 2 measures."
     lines = [
         fine,
         replace(fine, measure="renders", word="visible"),
         replace(fine, measure="file", word="inconclusive"),
     ]
-    assert headline(lines) == "Within their limits: 1 of 3 measures. Visible: renders. Inconclusive: file."
+    assert headline(lines) == "Fine: 1 of 3 measures. Visible: renders. Inconclusive: file."

@@ -19,16 +19,17 @@ from keyss.core import (
     signal_of,
 )
 from keyss.files import write_bytes
+from keyss.fitting import FitConfig
 from keyss.lab.audits.parts import PARTS, Part, Progress
 from keyss.lab.audits.record import Audit
 from keyss.lab.audits.report import report_of
-from keyss.lab.audits.subject import Subject
+from keyss.lab.audits.subject import Subject, control_name
 from keyss.methods import registry
 from keyss.progress import Reporter, Share, reporter as default_reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs import read_record, write_record
 from keyss.runs.estimates import seconds_for
-from keyss.runs.files import REPORT, PathLike, as_scene, run_folder, stego_in
+from keyss.runs.files import CONTROLS, REPORT, PathLike, as_scene, run_folder, stego_in
 from keyss.runs.folder import PRIVATE, RunFolder, read_manifest
 from keyss.runs.open_run import open_run, read_run
 from keyss.runs.planning import cost_of_fit, view_seconds
@@ -79,7 +80,7 @@ def audit(
         opened = open_run(run, keys)
     subject = Subject(opened, resolve_device(device))
     settings = {"controls": controls, "only": only, "seed": seed, "device": subject.device.type}
-    seeds = tuple(opened.config.options.fit.seed_of(f"control {seed + index}") for index in range(controls))
+    seeds = _seeds(opened.config.options.fit, controls, seed)
     earlier = _earlier(opened.folder, seeds)
     adds = not resume and earlier is not None and not earlier.sections.keys() & parts.keys()
     folder = RunFolder(
@@ -159,10 +160,15 @@ def _chosen(only: Sequence[str], method: str) -> dict[str, Part]:
     return {name: part for name, part in parts.items() if name in (only or parts)}
 
 
+def _seeds(fit: FitConfig, controls: int, seed: int) -> tuple[int, ...]:
+    """The seeds of the controls."""
+    return tuple(fit.seed_of(f"control {seed + index}") for index in range(controls))
+
+
 def forecast_audit(
-    run: PathLike, *, controls: int = 3, only: Sequence[str] = (), device: Backend = "auto"
+    run: PathLike, *, controls: int = 3, only: Sequence[str] = (), seed: int = 0, device: Backend = "auto"
 ) -> dict[str, float]:
-    """About the seconds of each part of an audit, and of the training of its controls; needs no keys.
+    """About the seconds of each part of an audit, and of the training of missing controls; needs no keys.
 
     Warns (KeyssWarning) without the extra `audit`.
     """
@@ -170,14 +176,15 @@ def forecast_audit(
         _check_extras()
     except BackendError as error:
         warnings.warn(str(error), KeyssWarning, stacklevel=2)
-    _, config, metrics, sources = read_run(Path(run))
+    folder, config, metrics, sources = read_run(Path(run))
     parts, target = _chosen(only, config.method), resolve_device(device)
     scenes = [as_scene(source, config.views, train_pictures=False) for source in sources]
     counts = [metrics.gaussians, *metrics.secret_gaussians]
     views = sum(view_seconds(target.type, *pair) for pair in zip(counts, scenes, strict=True))
-    training = controls * cost_of_fit(scenes[0], config.options.fit, target).seconds
+    names = [control_name(number, "*") for number in _seeds(config.options.fit, controls, seed)]
+    missing = sum(not any((folder / CONTROLS).glob(name)) for name in names)
     return {
-        "controls": training,
+        "controls": missing * cost_of_fit(scenes[0], config.options.fit, target).seconds,
         **{name: part.work.time(views, metrics.gaussians) for name, part in parts.items()},
     }
 

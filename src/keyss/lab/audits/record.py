@@ -77,7 +77,7 @@ def headline(verdicts: Sequence[Verdict]) -> str:
     if not verdicts:
         return "No part that was measured has a limit."
     fine = sum(verdict.word == "fine" for verdict in verdicts)
-    sentences = [f"Within their limits: {fine} of {len(verdicts)} measures."]
+    sentences = [f"Fine: {fine} of {len(verdicts)} measures."]
     for word in ("visible", "missed", "inconclusive"):
         if names := [verdict.measure for verdict in verdicts if verdict.word == word]:
             sentences.append(f"{word.capitalize()}: {', '.join(names)}.")

@@ -38,6 +38,11 @@ class Work:
         return 0.1 + self.seconds + self.views * view_seconds + self.per_gaussian * gaussians
 
 
+def control_name(seed: int, digest: str) -> str:
+    """The name of a control's file; `digest` is of its inputs."""
+    return f"seed-{seed}-{digest}.ply"
+
+
 @dataclass
 class Subject:
     """A run, and data that its measures share; models on `device`."""
@@ -114,11 +119,11 @@ class Subject:
         """Fit a plain model of the cover, or read it from the run's folder."""
         cover = self.scenes[0]
         inputs = json.dumps({"scene": cover.digest(), "config": asdict(config)}, sort_keys=True)
-        name = f"seed-{config.seed}-{hashlib.sha256(inputs.encode()).hexdigest()[:12]}"
-        model = f"{CONTROLS}/{name}.ply"
+        name = control_name(config.known_seed, hashlib.sha256(inputs.encode()).hexdigest()[:12])
+        model = f"{CONTROLS}/{name}"
         if (folder.path / model).exists():
             return read_model(folder.path / model)
-        checkpoint = folder.checkpoints / f"{name}.safetensors"
+        checkpoint = folder.checkpoints / name.replace(".ply", ".safetensors")
         result = fit_scene(
             cover,
             config,

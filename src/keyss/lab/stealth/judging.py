@@ -41,6 +41,7 @@ class StealthResult:
     statistics: tuple[JudgedStatistic, ...]  # the least likely first
     least: float  # minimum of the p-values, corrected for their number
     least_of_controls: float  # for a control judged by the others, corrected for the number of controls too
+    least_of_original: float = 1.0  # for the cover's own plain model
     invisible_groups: int = 0  # modes of invisible opacities: countable secrets
     changed_low_bits: float = 0.0  # share of the Gaussians that differ from the cover's model in low bits
 
@@ -76,10 +77,12 @@ def judge(
         for index, control in enumerate(others)
         if len(others) > 2
     )
+    of_original = [] if original is None else compare_statistics(stealth_statistics(original), others)
     return StealthResult(
         statistics=tuple(rows),
         least=least_p(rows),
         least_of_controls=min(1.0, len(others) * min(map(least_p, of_controls), default=1.0)),
+        least_of_original=least_p(of_original),
         invisible_groups=len(invisible_modes(file)),
         changed_low_bits=0.0 if original is None else changed_low_bits(file, original),
     )
