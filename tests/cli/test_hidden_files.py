@@ -100,7 +100,7 @@ def test_invalid_combinations(keyss: Run, folder: Path, workspace: Path, tmp_pat
     assert_refused(keyss(*photos, "--key-file", folder / "key0"), 2, "needs a model as the cover")
     stego, key = folder / "out" / "publish" / "model.ply", ("--key-file", folder / "key0")
     assert_refused(keyss("reveal", stego, *key, "-o", tmp_path / "s.ply"), 2, "3,000 bytes, 'letter.pdf'")
-    assert_refused(keyss("reveal", stego, *key, "-o", back, "--force"), 2, "--force")
+    assert_refused(keyss("reveal", stego, *key, "-o", back, "--frame", "cover"), 2, "--frame is for scenes")
     assert_refused(keyss("reveal", folder / "cover.ply", *key, "-o", back), 3, "opens nothing")
     assert_refused(keyss("reveal", stego, *key, "-o", stego.parent / "back"), 5, "given away")
     assert listing(tmp_path) == {}

@@ -48,7 +48,7 @@ class OpenedWhole(HiddenScene):
     model: Gaussians
     frame = None
 
-    def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
+    def reveal(self, stego: Gaussians, *, frame: Frame = "secret") -> Gaussians:
         return self.model
 
     def fingerprint(self) -> str:

@@ -123,6 +123,6 @@ def _refusal(path: Path, result: Conversion, lost: Sequence[int]) -> str:
     formats = [name for name, suffix in SUFFIXES.items() if path.name.lower().endswith(suffix)]
     cures = ['`publish="converted"`', *(f'`format="{name}"`' for name in formats)]
     return (
-        f"{which} would be lost: {left}{why}; nothing was written; hide it with {' or '.join(cures)}, or "
-        "convert the model without it: `force=True`"
+        f"{which} would be lost: {left}{why}; nothing was written; hide it by the method carry with "
+        f"{' or '.join(cures)}, or convert the model without it: `force=True`"
     )

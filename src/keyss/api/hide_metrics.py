@@ -72,13 +72,14 @@ def check_quality(
             cure = '; `publish="converted"` keeps all of them, and shows that there is a secret'
         least = _MIN_PRUNED_PSNR if pruned and not prepared.trains else _MIN_PSNR
         limit = least if min_psnr is None else min_psnr
-        if fidelity.psnr < limit:
+        better = min(fidelity.nothing + _BETTER_THAN_NOTHING, _GOOD)
+        is_empty = fidelity.psnr < better or fidelity.nothing > _EMPTY
+        if fidelity.psnr < limit and not is_empty:
             raise QualityError(
                 f"{fact}, below {limit:g} dB: nothing was published; a lower `min_psnr` publishes it"
                 f"{again}{cure}"
             )
-        better = min(fidelity.nothing + _BETTER_THAN_NOTHING, _GOOD)
-        if limit > 0 and (fidelity.psnr < better or fidelity.nothing > _EMPTY):
+        if limit > 0 and is_empty:
             raise QualityError(
                 f"{fact}, and empty renders are at {fidelity.nothing:.1f} dB: nothing was published; "
                 f"`min_psnr=0` publishes it anyway{again}{cure}"

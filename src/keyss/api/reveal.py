@@ -24,7 +24,6 @@ def reveal(
     *,
     companion: PathLike | None = None,
     frame: Frame = "secret",
-    force: bool = False,
     device: Backend = "auto",
     out: PathLike | None = None,
     overwrite: bool = False,
@@ -32,11 +31,10 @@ def reveal(
     """Reveal the secret that `key` opens in a stego model: a scene, as an ordinary model, or a file.
 
     The model determines the method. `frame`: "secret" gives a scene in its own frame, in which its cameras
-    are valid; "cover" leaves it in the cover's, in which carried secrets have no position. `force` is for
-    quantised or pruned models with a secret of the method `keyss`: it skips the check that a decoder belongs
-    to the model, and accepts any loss. `companion`: the companion file of this secret, for methods without
-    keys (`keyss.methods.companion`). Some of these methods give a model that a network decodes
-    (`keyss.core.picture_network`), which is no 3DGS model.
+    are valid; "cover" leaves it in the cover's, in which carried secrets have no position.
+    `companion`: the companion file of this secret, for methods without keys (`keyss.methods.companion`). Some
+    of these methods give a model that a network decodes (`keyss.core.picture_network`), which is no 3DGS
+    model.
 
     `out` (a file) gets the secret: a scene in the format of the suffix (.ply, .spz, ...), or the bytes of a
     file. Raises UsageError for a suffix of the wrong kind, WrongKeyError for a key that opens nothing,
@@ -51,9 +49,8 @@ def reveal(
         check_not_an_input(path, [] if isinstance(stego, Gaussians) else [Path(stego)])
         check_output_file(path, overwrite)
         check_not_published(path)
-    revealed = reveal_secret(as_model(stego), key, target, frame=frame, force=force, companion=companion)
-    if not force:
-        revealed.check_usable()
+    revealed = reveal_secret(as_model(stego), key, target, frame=frame, companion=companion)
+    revealed.check_usable()
     if path is not None:
         _write(revealed, path)
     for sentence in revealed.warnings:

@@ -29,7 +29,10 @@ from keyss.kernels.parallel import in_blocks
 
 MAX_SHARDS = 1 << 13  # per codeword; the field would allow more, at a cost in time
 SYMBOL_BYTES = 2
-LOST = "the key is right, but too much of the model was lost or changed since the secret was hidden in it"
+LOST = (
+    "the key is right, but too much of the model was lost or changed since the secret was hidden in it: use "
+    "the file as it was published"
+)
 _POLYNOMIAL = 0x1100B
 _ORDER = (1 << 16) - 1  # order of the generator 2
 _ZERO = 2 * _ORDER  # logarithm of 0: sums with other logarithms are exponents of 0
@@ -92,7 +95,8 @@ class Codewords:
                 data: Bytes = shards.take(rows[: self.k], axis=0)
                 _restore(shards, rows, data)
                 return data.reshape(-1).data
-        raise InputError(f"{LOST}: {len(np.unique(places)):,} of {self.shards:,} shards are left")
+        left, needed = len(np.unique(places)), self.count * self.k
+        raise InputError(f"{LOST} ({left:,} of {self.shards:,} shards are left, at least {needed:,} needed)")
 
     def _drop_errors(self, rows: Integers, shards: Bytes) -> None:
         """Set the `rows` [n, count] of false shards to -1."""

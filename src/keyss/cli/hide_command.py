@@ -56,7 +56,8 @@ class Details:
         float | None,
         optional(
             "DB",
-            "Fail if the PSNR of cover or secret to its plain model is below this.",
+            "Fail if the PSNR of cover or secret to its plain model is below this, or, unless it is 0, no "
+            "better than that of empty renders.",
             "20, and 25 for secrets that were pruned without fine-tuning",
         ),
     ] = None

@@ -32,13 +32,6 @@ def reveal(
     frame: Annotated[
         Literal["secret", "cover"], arg(help="Coordinates: the secret's own, or those it was hidden in.")
     ] = "secret",
-    force: Annotated[
-        bool,
-        switch(
-            "For secrets of --method keyss: write what is left in a quantised or pruned model. Others open "
-            "whole or not at all."
-        ),
-    ] = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
 ) -> None:
@@ -67,7 +60,6 @@ def reveal(
             key,
             companion=companion,
             frame=frame,
-            force=force,
             device=device,
             out=out,
             overwrite=overwrite,

@@ -35,7 +35,6 @@ from .robustness.converters import Converter as Converter, converters as convert
 from .robustness.survival import (
     ChangedQuality as ChangedQuality,
     measure_robustness as measure_robustness,
-    reveal_changed as reveal_changed,
 )
 from .stealth.judging import (
     changed_low_bits as changed_low_bits,

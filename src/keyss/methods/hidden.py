@@ -56,8 +56,8 @@ class HiddenScene(ABC):
         return 0
 
     @abstractmethod
-    def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
-        """The secret as a standalone model on the CPU; `force`: even from a changed model.
+    def reveal(self, stego: Gaussians, *, frame: Frame = "secret") -> Gaussians:
+        """The secret as a standalone model on the CPU.
 
         Raises InputError if it does not belong to the model, UsageError for a frame in which it has no
         position.

@@ -46,7 +46,7 @@ class Revealed:
         if self.file is None and self.recovered.share < MIN_LEFT:
             raise InputError(
                 f"{_count(self.recovered)}, too few to render (expected at least {MIN_LEFT:.0%}): the others "
-                f"{_CAUSE}; use the file as it was published, or `force=True` to get the rest"
+                f"{_CAUSE}; use the file as it was published"
             )
 
 
@@ -62,7 +62,6 @@ def reveal_secret(
     device: torch.device,
     *,
     frame: Frame = "secret",
-    force: bool = False,
     companion: PathLike | None = None,
 ) -> Revealed:
     """The secret that `key` opens in a stego model, however little is left; raises as `keyss.reveal` does."""
@@ -72,14 +71,12 @@ def reveal_secret(
         raise UsageError("companion files have no keys: whoever has one sees the secret")
     secret = registry.open_secret(model, key) if key is not None else read_companion(companion or "")
     if isinstance(secret, HiddenFile):
-        if force or frame != "secret":
-            raise UsageError(
-                f"this key opens a file, {secret.name!r}: `force` and `frame` are for scenes, leave them out"
-            )
+        if frame != "secret":
+            raise UsageError(f"this key opens a file, {secret.name!r}: `frame` is for scenes, leave it out")
         size = len(secret.data)
         recovered = Recovered(size, size, secret.shards)
         return Revealed(None, recovered, tuple(loss_warnings(recovered)) if size else (), secret)
-    revealed = secret.reveal(model.to(device), frame=frame, force=force)
+    revealed = secret.reveal(model.to(device), frame=frame)
     recovered = secret.recovered(revealed)
     return Revealed(revealed, recovered, tuple(loss_warnings(recovered)))
 

@@ -126,10 +126,9 @@ def test_anchors() -> None:
         secret.check_unchanged(replace(stego, means=stego.means * 1.001))
 
 
-def test_rounded_positions_need_force() -> None:
+def test_rounded_positions_are_refused() -> None:
     stego = trained_like(200)
     secret = make_secret(stego)
-    rounded = replace(stego, means=(stego.means * 500).round() / 500)
-    with pytest.raises(InputError, match="`force=True`"):
-        secret.reveal(rounded)
-    assert len(secret.reveal(rounded, force=True)) == 200
+    assert len(secret.reveal(stego)) == 200
+    with pytest.raises(InputError, match="use the file as it was published"):
+        secret.reveal(replace(stego, means=(stego.means * 500).round() / 500))

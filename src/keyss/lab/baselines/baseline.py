@@ -75,7 +75,7 @@ class CompanionSecret(HiddenScene):
     companion: CompanionTensors
     show: Show
 
-    def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
+    def reveal(self, stego: Gaussians, *, frame: Frame = "secret") -> Gaussians:
         """See `HiddenScene.reveal`; raises InputError for a model with other Gaussians."""
         rows = self.companion.rows
         if rows is not None and len(stego) != rows:

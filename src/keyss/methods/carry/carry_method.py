@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
 from keyss.channels import Channel, Payload, PreparedCover, open_payload
-from keyss.core.errors import KeyssWarning, UsageError
+from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
@@ -67,14 +66,8 @@ class CarriedSecret(HiddenScene):
         """Decoded when it is first needed: until then, a secret takes a fifth of the memory."""
         return decode(self.payload.data, self.payload.model_size)
 
-    def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
+    def reveal(self, stego: Gaussians, *, frame: Frame = "secret") -> Gaussians:
         """All Gaussians of the secret."""
-        if force:
-            warnings.warn(
-                "`force=True` has no effect: this secret opens whole or not at all",
-                KeyssWarning,
-                stacklevel=2,
-            )
         if frame == "cover":
             raise UsageError(
                 'a carried secret has no position in the cover\'s coordinates: leave out `frame="cover"`'

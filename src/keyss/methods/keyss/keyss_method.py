@@ -183,10 +183,9 @@ class KeyssSecret(HiddenScene):
         return KeyssSecret(decoder, key, header.frame, anchors, header.count, payload.shards)
 
     @torch.no_grad()
-    def reveal(self, stego: Gaussians, *, frame: Frame = "secret", force: bool = False) -> Gaussians:
+    def reveal(self, stego: Gaussians, *, frame: Frame = "secret") -> Gaussians:
         """The secret as a standalone model, without invisible Gaussians; see `HiddenScene.reveal`."""
-        if not force:
-            self.check_unchanged(stego)
+        self.check_unchanged(stego)
         decoded = self.decode(stego, self.key).to("cpu")
         if (visible := decoded.opacities >= DRAWN_OPACITY).any():
             decoded = decoded[visible]
@@ -222,8 +221,8 @@ class KeyssSecret(HiddenScene):
         if share < ANCHORS_NEEDED:
             raise InputError(
                 "the model was moved or rounded since its decoder was trained, or it is another one: "
-                f"{share:.0%} of the decoder's anchors are there, at least {ANCHORS_NEEDED:.0%} expected "
-                "(`force=True` tries all the same)"
+                f"{share:.0%} of the decoder's anchors are there, at least {ANCHORS_NEEDED:.0%} expected; "
+                "use the file as it was published"
             )
 
 
