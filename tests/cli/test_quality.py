@@ -74,7 +74,10 @@ def test_empty_secret_is_not_published(keyss: Run, models: Path, monkeypatch: py
         return replace(found, opacity_logits=torch.full_like(found.opacity_logits, -20))
 
     monkeypatch.setattr(CarriedSecret, "reveal", empty)
-    assert_refused(keyss(*_carry(models, "--min-psnr", 1)), 7, "empty renders")
+    for limit in (1, 60):  # below and above its PSNR
+        refused = keyss(*_carry(models, "--min-psnr", limit))
+        assert_refused(refused, 7, "empty renders")
+        assert "--min-psnr 0 publishes it anyway" in refused.err
     assert_refused(keyss(*_carry(models, "--min-psnr", "nan")), 2, "--min-psnr: expected a number of dB")
     assert not (models / "run").exists()
 

@@ -13,13 +13,7 @@ import keyss
 from keyss import CarryOptions
 from keyss.core import Gaussians, KeyssWarning, Scene, Similarity, UsageError, WrongKeyError
 from keyss.fitting import mean_psnr
-from keyss.lab import (
-    ChangedQuality,
-    half_floats,
-    measure_robustness,
-    purification,
-    random_pruning,
-)
+from keyss.lab import ChangedQuality, half_floats, measure_robustness, purification, random_pruning
 from keyss.methods import HiddenScene, open_model
 from lab.known_scene import Whole
 from methods.carry.test_fine_tuning import TINY

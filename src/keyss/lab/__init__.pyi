@@ -32,10 +32,7 @@ from .robustness.changes import (
     random_pruning as random_pruning,
 )
 from .robustness.converters import Converter as Converter, converters as converters, transform as transform
-from .robustness.survival import (
-    ChangedQuality as ChangedQuality,
-    measure_robustness as measure_robustness,
-)
+from .robustness.survival import ChangedQuality as ChangedQuality, measure_robustness as measure_robustness
 from .stealth.judging import (
     changed_low_bits as changed_low_bits,
     judge as judge,
