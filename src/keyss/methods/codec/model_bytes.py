@@ -22,7 +22,6 @@ from __future__ import annotations
 import math
 import struct
 from dataclasses import dataclass, fields, replace
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -53,8 +52,6 @@ _LEAST_W = 1 / 16  # minimum w^2
 # Harmonics have two more groups and no prediction.
 _SHARES = (8, 8, 8, 2, 2, 2, 2, 6, 6, 6, 0, 0, 0)
 _GROUPS = (0, 0, 0, 1, 1, 1, 2, 3, 4, 4, 5, 5, 5)
-
-_ORDERS: WeakKeyDictionary[Gaussians, Integers] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True)
@@ -117,9 +114,9 @@ class _Encoder:
     typical: float = 0.0  # logarithm of a weight
 
     @staticmethod
-    def of(given: Gaussians, precision: Precision | None) -> _Encoder:
-        model = given.detach().to("cpu")
-        order, transparent = _order(given), model.overflow.numpy()
+    def of(model: Gaussians, precision: Precision | None) -> _Encoder:
+        model = model.detach().to("cpu")
+        order, transparent = morton_order(model.means.numpy()), model.overflow.numpy()
         rows = order[:: 1 + len(order) // _TYPICAL]
         some = model[torch.from_numpy(rows)]
         middle = [
@@ -227,13 +224,6 @@ def decode(data: bytes, model_size: int | None = None) -> Gaussians:
 
     in_blocks(fill, count, BLOCK, entropy.read)
     return Gaussians(*map(torch.from_numpy, (means, quats, log_scales, logits, sh)))
-
-
-def _order(model: Gaussians) -> Integers:
-    """`morton_order`, computed once for all precisions."""
-    if model not in _ORDERS:
-        _ORDERS[model] = morton_order(model.means.detach().cpu().numpy())
-    return _ORDERS[model]
 
 
 def _columns(sh_degree: int) -> tuple[Integers, Integers]:
