@@ -66,7 +66,7 @@ def check_quality(
         who = "the cover" if index == 0 else "the secret" if len(shown) == 2 else f"secret {index}"
         pruned = not joint and len(model) < before.gaussians
         kept = f" with {len(model):,} of {before.gaussians:,} Gaussians" if pruned else ""
-        fact = f"{who}{kept} is at {fidelity.psnr:.2f} dB PSNR to its plain model (mean error of all views)"
+        fact = f"{who}{kept} is at {fidelity.psnr:.2f} dB PSNR to its plain model (mean error of test views)"
         cure = "; more training steps (`iterations`) bring it nearer" * joint
         if pruned and not prepared.survives:
             cure = '; `publish="converted"` keeps all of them, and shows that there is a secret'

@@ -143,12 +143,12 @@ def plain_background(photos: Sequence[tuple[Tensor, Tensor | None]]) -> Tensor:
 
     `photos`: uint8 images [H, W, 3] and masks [H, W] of the pixels that count.
     """
-    pixels = []
-    for image, mask in photos:
-        edges = torch.ones(image.shape[:2], dtype=torch.bool)
-        edges[1:-1, 1:-1] = False
-        pixels.append(image[edges if mask is None else edges & mask])
-    around = torch.cat(pixels).float()
+
+    def edges(of: Tensor) -> Tensor:
+        return torch.cat([of[0], of[-1], of[1:-1, 0], of[1:-1, -1]])
+
+    parts = [edges(image) if mask is None else edges(image)[edges(mask)] for image, mask in photos]
+    around = torch.cat(parts).float()
     if not len(around):
         return torch.zeros(3)
     colour = around.median(0).values

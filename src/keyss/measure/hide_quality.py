@@ -59,7 +59,7 @@ class WrongKeys:
 class RenderFidelity:
     """Renders of a model against renders of its plain model, on test cameras."""
 
-    psnr: float  # dB, from the mean squared error over all views; at most 120
+    psnr: float  # dB, from the mean squared error over at most 8 views; at most 120
     nothing: float  # dB, empty renders against those of the plain model
 
 

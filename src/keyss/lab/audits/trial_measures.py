@@ -30,7 +30,7 @@ Numbers = dict[str, float | str]
 PRUNED_SHARES = (0.05, 0.10, 0.15, 0.25)  # fractions of the Gaussians
 _LOST = 0.25  # fraction of the Gaussians
 _GIVEN_UP = 0.01  # fraction of the blending weight in the cover's views that purification removes
-CONVERSIONS = {".spz": "gsply", "compressed .ply": "gsply"}  # format and the program that writes it
+CONVERSIONS = ".spz", "compressed .ply"  # formats, written by gsply
 _EVERY_VIEW = 10**6
 _ROUNDS = 5  # repetitions when timing renders
 _WHOLE = "whole"  # the unchanged model
@@ -81,7 +81,7 @@ def survival(subject: Subject) -> Numbers:
     tools = {(converter.format, converter.tool): converter for converter in converters()}
     changes = {"pruned": random_pruning(_LOST)}
     if subject.standard:
-        changes |= {format: tools[format, tool].change() for format, tool in CONVERSIONS.items()}
+        changes |= {format: tools[format, "gsply"].change() for format in CONVERSIONS}
         changes["purified"] = purification(subject.scenes[0], _GIVEN_UP)
     numbers = _after(subject, changes, lambda quality: 0.0 - quality.loss)
     numbers = {name: value for name, value in numbers.items() if not name.startswith(_WHOLE)}
