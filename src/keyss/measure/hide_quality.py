@@ -160,6 +160,7 @@ def compare(model: Gaussians, plain: Gaussians | None, scene: Scene, *, of_plain
     images are renders of the plain model, which is then not needed.
     """
     background = scene.background.to(model.device)
+    plain = None if plain is None else plain.to(model.device)
     compared = set(map(id, subsample_views(scene.test, _FIDELITY_VIEWS)))
     qualities: list[ImageQuality] = []
     plains: list[ImageQuality] = []

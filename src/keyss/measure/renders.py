@@ -11,11 +11,13 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from keyss.core import Camera, Gaussians, Scene, View
+from keyss.core import Camera, Gaussians, View
 from keyss.core.arrays import Bytes
 from keyss.files.images import png_names
 from keyss.fitting.image_metrics import subsample_views
+from keyss.methods.method import Source, role_of
 from keyss.rendering import render
+from keyss.rendering.orbit import from_above
 
 
 def select_views(views: Sequence[View]) -> list[View]:
@@ -33,14 +35,16 @@ def renders_of(model: Gaussians, cameras: Sequence[Camera], background: Tensor) 
     return renders
 
 
-def sheet_of(columns: Sequence[tuple[str, str, Scene, Gaussians]]) -> bytes:
-    """A PNG of three test views: images and renders, by role, kind of the images, scene and model."""
+def sheet_of(models: Sequence[Gaussians], sources: Sequence[Source]) -> bytes:
+    """A PNG of three test views of cover and secrets: images, and renders of the models after hiding."""
     heads: list[str] = []
     pictures: list[list[Bytes]] = []
-    for role, kind, scene, model in columns:
+    for index, (model, source) in enumerate(zip(models, sources, strict=True)):
+        role, kind = role_of(index, len(sources)), "photo" if source.photos else "given model"
+        scene = source.scene if source.photos else from_above(source.scene)
         shown = subsample_views(scene.test, 3)
         renders = renders_of(model, [view.camera for view in shown], scene.background)
-        heads += [f"{role}, {kind}", f"{role}, {'published' if not heads else 'revealed'}"]
+        heads += [f"{role}, {kind}", f"{role}, {'revealed' if index else 'published'}"]
         pictures += [[view.image.numpy() for view in shown], [image.numpy() for _, image in renders]]
     count = min(map(len, pictures))
     rows = {f"view {row + 1}": [column[row] for column in pictures] for row in range(count)}

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.fitting.config import FitConfig
 from keyss.fitting.plain import fit_scene
-from keyss.methods.method import Context, Source, Training, role_of, role_phrase
+from keyss.methods.method import Context, Source, role_of, role_phrase
 
 
 def fit_plain_models(
@@ -29,30 +29,10 @@ def fit_plain_models(
     }
     titles = [f"plain model of {role_phrase(role_of(index, len(sources)))}" for index in range(len(sources))]
     fitted = _fit_all(missing, "plain model", titles, context)
-    return [replace(source, given=fitted.get(index, source.given)) for index, source in enumerate(sources)]
-
-
-@dataclass(frozen=True)
-class Bound:
-    """An upper bound: plain 3DGS with as many Gaussians and training steps as a scene had."""
-
-    steps: int | None  # total training steps of the scene; None: unknown, its plain model was given
-    equal: bool  # True if the plain model has equal steps and is the upper bound itself
-
-    @staticmethod
-    def of(training: Training, plain_steps: int | None) -> Bound:
-        """The upper bound of a scene; `plain_steps`: steps of its plain model, if known."""
-        if not training.continues:
-            return Bound(training.steps, training.steps == plain_steps)
-        if not training.steps:
-            return Bound(plain_steps, True)
-        return Bound(None if plain_steps is None else plain_steps + training.steps, False)
-
-    def config(self, fit: FitConfig, gaussians: int | None = None) -> FitConfig:
-        """The fit, with at most `gaussians`; `steps` must be known."""
-        assert self.steps is not None
-        limit = fit.max_gaussians if gaussians is None else max(16, gaussians)
-        return replace(fit, iterations=self.steps, max_gaussians=limit)
+    return [
+        replace(source, given=fitted[index], steps=configs[index].iterations) if index in fitted else source
+        for index, source in enumerate(sources)
+    ]
 
 
 def fit_bounds(
