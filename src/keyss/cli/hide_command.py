@@ -169,12 +169,14 @@ def hide(args: HideArguments) -> None:
 def _print_result(args: HideArguments, result: HideResult) -> None:
     """Print measurements, files and what to do with them, or the plan of a dry run."""
     from keyss import progress
-    from keyss.cli.tables import print_files, print_hiding, print_plan
+    from keyss.cli.tables import print_cost, print_files, print_hiding
     from keyss.methods import registry
     from keyss.runs.files import COMPANIONS, LOOK, STEGOS
 
-    if result.plan is not None and result.cost is not None:
-        print_plan(args.method, result.plan, result.cost)
+    if (plan := result.plan) is not None and result.cost is not None:
+        size = f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, {plan.megabytes:,.1f} MB"
+        rows = [("method", args.method), ("capacity", plan.room), ("published", size)]
+        print_cost(result.cost, rows, plan.notes)
         return
     if result.psnr is not None:
         for file in args.secret_file:

@@ -88,7 +88,7 @@ def cost_of(
             renders += training.total(plain_steps or None) or 0
             saved.append(size)
             written.append(size)
-        step = step_seconds(device.type, size, _pixels(source.scene))
+        step = _STEP_SECONDS[device.type] * (size + _pixels(source.scene) / 2)
         seconds += renders * step
         views.append(view_seconds(device.type, size, source.scene))
         check_seconds += len(source.scene.test) * views[-1] + _READ_SECONDS * size
@@ -122,11 +122,6 @@ def view_seconds(device: str, gaussians: int, scene: Scene) -> float:
     """About the seconds to measure a model, and its plain model, on one test view of a scene."""
     per_gaussian, per_pixel = _VIEW_SECONDS[device]
     return per_gaussian * gaussians + per_pixel * _pixels(scene)
-
-
-def step_seconds(device: str, gaussians: int, pixels: int) -> float:
-    """About the seconds of a training step on a device, "cpu" or "cuda"."""
-    return _STEP_SECONDS[device] * (gaussians + pixels / 2)
 
 
 def _pixels(scene: Scene) -> int:
