@@ -17,7 +17,6 @@ from keyss.api.hide_arguments import (
     SecretFile,
     check_arguments,
     check_not_given,
-    has_photos,
     method_for,
     read_sources,
     with_renders,
@@ -40,6 +39,7 @@ from keyss.methods.plain_models import fit_bounds, fit_plain_models
 from keyss.methods.registry import DEFAULT, open_companion, open_model
 from keyss.progress import Reporter, reporter as default_reporter
 from keyss.rendering import Backend, resolve_device
+from keyss.rendering.orbit import is_model
 from keyss.runs.estimates import seconds_for
 from keyss.runs.files import (
     CONFIG,
@@ -124,7 +124,7 @@ def hide(
         method=chosen.name,
         cover=path_of(cover),
         secrets=tuple(path_of(secret.scene) for secret in given[1:]),
-        models_given=tuple(one.model is not None or not has_photos(one.scene) for one in given),
+        models_given=tuple(one.model is not None or is_model(one.scene) for one in given),
         views=views,
         payloads=(),
         options=options,

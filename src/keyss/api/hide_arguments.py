@@ -113,11 +113,6 @@ def check_not_given(**for_scenes: object) -> None:
             raise UsageError(f"`{name}` is for hidden scenes, not for files: leave it out")
 
 
-def has_photos(scene: PathLike | Scene | Gaussians) -> bool:
-    """True for a scene of photos, False for a model."""
-    return isinstance(scene, Scene) or not is_model(scene)
-
-
 def read_sources(given: Sequence[Secret], views: ViewOptions) -> list[Source]:
     """Read photos and models of the cover and the secrets. Raises UsageError and InputError."""
     names = ["the cover"] + ["the secret"] * (len(given) - 1)
@@ -125,7 +120,7 @@ def read_sources(given: Sequence[Secret], views: ViewOptions) -> list[Source]:
     # Reading large files takes seconds each, mostly without the GIL.
     with ThreadPoolExecutor(_READERS) as readers:
         models = readers.map(_read_visible, places, names)
-        scenes = [as_scene(one.scene, views) if has_photos(one.scene) else None for one in given]
+        scenes = [None if is_model(one.scene) else as_scene(one.scene, views) for one in given]
         sources = []
         for one, place, scene, model in zip(given, places, scenes, models, strict=True):
             if model is not None and scene is not None and place is not None:
@@ -137,7 +132,7 @@ def read_sources(given: Sequence[Secret], views: ViewOptions) -> list[Source]:
 def _place_of_model(given: Secret, name: str) -> PathLike | Gaussians | None:
     """The plain model of a scene, which may be a model itself. Raises UsageError for two models."""
     scene, model = given.scene, given.model
-    if isinstance(scene, Scene) or has_photos(scene):
+    if not is_model(scene):
         return model
     if model is not None and model is not scene and path_of(model) != (path_of(scene) or ""):
         argument = "cover_model" if name == "the cover" else "model"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -126,6 +127,14 @@ def check_seed(seed: int) -> int:
     if not 0 <= seed < 1 << 32:
         raise UsageError(f"--seed: expected 0 to {(1 << 32) - 1}, got {seed}")
     return seed
+
+
+def waiting_for(task: str, what: str, model: Path) -> AbstractContextManager[Any]:
+    """While the context is open, a line says `what` is done and how long the task takes for a model."""
+    from keyss.progress import waiting
+    from keyss.runs.estimates import seconds_for
+
+    return waiting(f"{what} {model.name}", seconds_for(task, model))
 
 
 def verb(name: str) -> Any:

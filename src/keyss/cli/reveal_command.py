@@ -7,7 +7,16 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from keyss.cli.arguments import Device, KeyFilesToCheck, OneKeyFile, Overwrite, check_exists, optional, switch
+from keyss.cli.arguments import (
+    Device,
+    KeyFilesToCheck,
+    OneKeyFile,
+    Overwrite,
+    check_exists,
+    optional,
+    switch,
+    waiting_for,
+)
 from keyss.cli.keys import given_keys, keys
 from keyss.core.errors import InputError
 from keyss.files.atomic import check_not_an_input, check_output_file
@@ -51,10 +60,8 @@ def reveal(
     if companion is None or key_file:
         (key,) = keys(key_file, 1)
     from keyss.cli.tables import print_written
-    from keyss.progress import waiting
-    from keyss.runs.estimates import seconds_for
 
-    with waiting(f"opening {stego.name}", seconds_for("reveal", stego)):
+    with waiting_for("reveal", "opening", stego):
         revealed = keyss.reveal(
             stego,
             key,
@@ -88,11 +95,9 @@ def verify(
     check_exists(model, keys=key_file)
     import keyss
     from keyss.cli.tables import print_json, print_verification
-    from keyss.progress import waiting
-    from keyss.runs.estimates import seconds_for
 
     given = given_keys(key_file)
-    with waiting(f"checking {model.name}", seconds_for("reveal" if given else "verify", model)):
+    with waiting_for("reveal" if given else "verify", "checking", model):
         checked = keyss.verify(model, given, device=device)
     (print_json if json_ else print_verification)(checked)
     if checked.problems:

@@ -19,6 +19,7 @@ from keyss.cli.arguments import (
     optional,
     switch,
     verb,
+    waiting_for,
 )
 from keyss.cli.keys import keys_of_run
 from keyss.core.errors import UsageError
@@ -68,8 +69,6 @@ def view(
     """
     check_exists(model)
     from keyss.cli.tables import print_written
-    from keyss.progress import waiting
-    from keyss.runs.estimates import seconds_for
 
     if pose and not re.fullmatch(_POSE, pose):
         raise UsageError(f"--pose: expected eye=X,Y,Z&target=X,Y,Z as in the page's address, got {pose}")
@@ -78,7 +77,7 @@ def view(
     if out is not None:
         if port or host != "127.0.0.1":
             raise UsageError("--port and --host are for serving: leave them out with -o")
-        with waiting(f"writing {out.name}", seconds_for("export", model)):
+        with waiting_for("export", "exporting", model):
             from keyss.viewer import export_html
 
             written = export_html(model, out, look=_look(model, changed), overwrite=overwrite)
@@ -90,7 +89,7 @@ def view(
         raise UsageError("--overwrite, --allow-host and --embed-in are for -o: leave them out")
     if not 0 <= port < 1 << 16:
         raise UsageError(f"--port: expected 0 to {(1 << 16) - 1}, got {port}")
-    with waiting(f"reading {model.name}", seconds_for("export", model)):
+    with waiting_for("export", "reading", model):
         from keyss.viewer import ModelServer
 
         server = ModelServer(model, host, port, _look(model, changed))
@@ -133,10 +132,8 @@ def render(
     check_exists(model, cameras)
     import keyss
     from keyss.cli.tables import print_written
-    from keyss.progress import waiting
-    from keyss.runs.estimates import seconds_for
 
-    with waiting(f"rendering {model.name}", seconds_for("render", model)):
+    with waiting_for("render", "rendering", model):
         images = keyss.render(
             model, cameras, split=split, views=photos.views(), device=device, out=out, overwrite=overwrite
         )
@@ -162,11 +159,9 @@ def info(
     example: keyss info runs/hidden/publish/model.ply
     """
     from keyss.cli.tables import print_info, print_json
-    from keyss.progress import waiting
     from keyss.runs.describe import info as describe
-    from keyss.runs.estimates import seconds_for
 
-    with waiting(f"reading {path.name}", seconds_for("info --capacity" if capacity else "info", path)):
+    with waiting_for("info --capacity" if capacity else "info", "reading", path):
         described = describe(path, capacity=capacity)
     (print_json if json_ else print_info)(described)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import io
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from PIL import Image, ImageDraw, ImageFont
@@ -66,14 +66,16 @@ def contact_sheet(heads: Sequence[str], rows: Mapping[str, Sequence[Bytes]], cel
         for pictures in rows.values()
     ]
     left = math.ceil(max(map(font.getlength, rows))) + 2 * gap
-    widths = [
-        max(
-            *(math.ceil(font.getlength(word)) for word in head.split()),
-            *(picture.width for picture in pictures),
-        )
-        for head, pictures in zip(heads, zip(*scaled, strict=True), strict=True)
-    ]
-    wrapped = [_wrapped(head, width, font) for head, width in zip(heads, widths, strict=True)]
+    letter, wrapped, widths = font.getlength("n"), [], []
+    for head, column in zip(heads, zip(*scaled, strict=True), strict=True):
+        width = max(picture.width for picture in column)
+        lines = [
+            line
+            for part in head.split("\n")
+            for line in textwrap.wrap(part, max(1, int(width / letter)), break_long_words=False)
+        ]
+        wrapped.append("\n".join(lines))
+        widths.append(max(width, *(math.ceil(font.getlength(line)) for line in lines)))
     places = [left + sum(widths[:column]) + gap * column for column in range(len(heads))]
     top = gap + (1 + max(head.count("\n") for head in wrapped)) * (cell // 8)
     size = (left + sum(widths) + gap * len(heads), top + (cell + gap) * len(rows))
@@ -89,18 +91,3 @@ def contact_sheet(heads: Sequence[str], rows: Mapping[str, Sequence[Bytes]], cel
     file = io.BytesIO()
     sheet.save(file, "PNG", optimize=True)
     return file.getvalue()
-
-
-def _wrapped(text: str, width: int, font: Any) -> str:
-    """`text` with line breaks between words, so that lines are at most `width` pixels wide."""
-    lines = []
-    for paragraph in text.split("\n"):
-        line = ""
-        for word in paragraph.split():
-            longer = f"{line} {word}".strip()
-            if line and font.getlength(longer) > width:
-                lines.append(line)
-                longer = word
-            line = longer
-        lines.append(line)
-    return "\n".join(lines)

@@ -117,7 +117,6 @@ class Capabilities:
 
     keys: bool = True  # a key opens each secret; else a companion file of the model shows it
     standard: bool = True  # the published model is a 3DGS model, which every viewer renders
-    models: bool = True  # revealed secrets are 3DGS models; else a network renders their images
 
 
 @dataclass(frozen=True)
