@@ -11,9 +11,6 @@ import pytest
 
 from cli.harness import COMMANDS, Result, Run, assert_refused
 from keyss import __version__
-from keyss.fitting import PRESETS as FIT_PRESETS
-from keyss.methods import registry
-from keyss.methods.carry.carry_options import FINE_TUNING
 
 
 def test_overview(keyss: Run) -> None:
@@ -46,15 +43,6 @@ def test_numbers_are_not_broken(keyss: Run, columns: int, monkeypatch: pytest.Mo
     monkeypatch.setenv("COLUMNS", str(columns))
     for command in COMMANDS:
         assert not re.search(r"\d,\s*│?\n│?\s*\d", keyss(command, "--help").out)
-
-
-def test_presets(keyss: Run) -> None:
-    assert f"--preset {{{','.join(FIT_PRESETS)}}}" in keyss("fit", "--help").out
-    for name in registry.METHODS:
-        result = keyss("hide", "--method", name, "--help").out
-        assert f"--preset {{{','.join(FIT_PRESETS)}}}" in result
-        assert "(default: default)" in result
-        assert f"{1 + FINE_TUNING} times the steps" in " ".join(result.replace("│", " ").split())
 
 
 def test_hide_snapshot(keyss: Run) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import signal
-import zipfile
 from pathlib import Path
 
 import pytest
@@ -110,11 +109,3 @@ def test_hidden_files(keyss: Run, workspace: Path, tmp_path: Path) -> None:
     assert keyss("hide", *cover, "--secret-file", tmp_path / "letter.txt", "-o", tmp_path / "run").status == 0
     assert re.search(r"kind +hiding of files", keyss("info", tmp_path / "run").out)
     assert "--format spz: " in keyss("info", tmp_path / "run", "--capacity").out
-
-
-def test_size_of_an_unpacked_sog(keyss: Run, tmp_path: Path) -> None:
-    write_model(tmp_path / "model.sog", trained_like(500))
-    with zipfile.ZipFile(tmp_path / "model.sog") as archive:
-        archive.extractall(tmp_path / "model")
-    size = sum(file.stat().st_size for file in (tmp_path / "model").iterdir())
-    assert re.search(rf"bytes +{size:,}\n", keyss("info", tmp_path / "model").out)
