@@ -11,7 +11,7 @@ import torch
 from keyss.core.errors import KeyssWarning, QualityError
 from keyss.core.gaussians import Gaussians
 from keyss.fitting.image_metrics import quality
-from keyss.measure.hide_quality import BaselineQuality, Shown, measure_hiding
+from keyss.measure.hide_quality import BaselineQuality, Shown, measure_without_keys
 from keyss.methods.method import Prepared, Source, Stego, Training
 from keyss.runs.run_records import HideMetrics
 
@@ -109,10 +109,14 @@ def hide_metrics(
         qualities[index] = quality(model.to(device), scene.test, scene.background.to(device))
         sizes[index], steps[index], equal[index] = len(model), plain[index].total_steps, True
     baseline = BaselineQuality(qualities[0], tuple(qualities[1:]), tuple(sizes), tuple(steps), tuple(equal))
-    measured = measure_hiding(stego.gaussians.to(device), stego.opened, scenes, shown, baseline, seed=seed)
+    wrong, chance = measure_without_keys(stego.gaussians.to(device), stego.opened, scenes, seed=seed)
     return HideMetrics(
-        **vars(measured),
         method=prepared.options.method,
+        cover=shown[0].quality,
+        secrets=tuple(render.quality for render in shown[1:]),
+        baseline=baseline,
+        wrong_key=wrong,
+        chance_level=chance,
         gaussians=len(stego.gaussians),
         photos=tuple(source.photos for source in sources),
         secret_gaussians=tuple(map(len, models[1:])),
