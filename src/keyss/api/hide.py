@@ -32,10 +32,9 @@ from keyss.keys import DerivedKey
 from keyss.keys.derivation import SALT_BYTES
 from keyss.measure.hide_quality import compare
 from keyss.measure.renders import sheet_of
-from keyss.methods.companion import pack
-from keyss.methods.hidden import HiddenScene
+from keyss.methods.hidden import HiddenScene, pack_companion
 from keyss.methods.method import Context, MethodOptions, Prepared, Source, Stego
-from keyss.methods.plain_models import fit_bounds, fit_plain_models
+from keyss.methods.plain_models import fit_bound, fit_plain_models
 from keyss.methods.registry import DEFAULT, open_companion, open_model
 from keyss.progress import Reporter, reporter as default_reporter
 from keyss.rendering import Backend, resolve_device
@@ -91,7 +90,7 @@ def hide(
 
     `out` (a folder) gets `publish/` with the stego model, and `private/` with fitted models, `config.json`,
     `metrics.json`, `look.png` (test views of cover and secrets before and after), companion files for methods
-    that need them (`keyss.methods.companion`), and checkpoints, from which `resume` continues. Without a seed
+    that need them (`keyss.methods.hidden`), and checkpoints, from which `resume` continues. Without a seed
     in the options' `fit` the run uses a random one, which `config.json` records. With a seed, the same
     arguments and number of threads give the same bytes on a CPU.
 
@@ -222,7 +221,7 @@ def _write_and_read(
 ) -> list[Gaussians]:
     """Write the files to give away, `published` among them, and read the stego model and the secrets back."""
     model, same = stego.gaussians, type(stego.gaussians) is Gaussians
-    packed = [pack(payload) for payload in stego.companions]
+    packed = [pack_companion(payload) for payload in stego.companions]
     if folder:
         companions = dict(zip(companion_names(len(packed)), packed, strict=True))
         name = stego_name(model)
@@ -247,15 +246,12 @@ def _fit_bounds(
     context: Context,
 ) -> dict[int, Gaussians]:
     """Upper bounds for scenes with more training steps than their plain models, by index."""
-    fit = prepared.options.fit
-    configs = {
+    fit, bounds = prepared.options.fit, {}
+    for index, (before, source, model) in enumerate(zip(plain, sources, models, strict=True)):
+        if before.is_bound or before.total_steps is None or not source.photos:
+            continue
         # The upper bound of a pruned secret has the size of what is left.
-        index: replace(
-            fit,
-            iterations=before.total_steps,
-            max_gaussians=max(16, len(model)) if len(model) < before.gaussians else fit.max_gaussians,
-        )
-        for index, (before, source, model) in enumerate(zip(plain, sources, models, strict=True))
-        if not before.is_bound and before.total_steps is not None and source.photos
-    }
-    return fit_bounds([source.scene for source in sources], configs, context)
+        size = max(16, len(model)) if len(model) < before.gaussians else fit.max_gaussians
+        config = replace(fit, iterations=before.total_steps, max_gaussians=size)
+        bounds[index] = fit_bound(source.scene, config, index, context)
+    return bounds

@@ -12,8 +12,8 @@ from keyss.channels import copies
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.files.inputs import read_file
-from keyss.methods import companion as companions, registry
-from keyss.methods.hidden import Frame, HiddenFile, HiddenScene, Recovered
+from keyss.methods import registry
+from keyss.methods.hidden import MAX_COMPANION_BYTES, Frame, HiddenFile, HiddenScene, Recovered
 from keyss.runs.files import PathLike
 
 MIN_LEFT = 0.1  # share; pruning compensation stops there, and renders become empty
@@ -114,7 +114,7 @@ def _count(recovered: Recovered) -> str:
 
 def read_companion(path: PathLike) -> HiddenScene:
     """Open the secret in a companion file; see `registry.open_companion`."""
-    data = read_file(Path(path), companions.MAX_BYTES)
+    data = read_file(Path(path), MAX_COMPANION_BYTES)
     try:
         return registry.open_companion(data)
     except InputError as error:

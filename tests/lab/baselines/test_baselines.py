@@ -78,7 +78,9 @@ def test_published_and_companion_file_reveal_the_secret(
     capabilities = registry.get(made.name).capabilities
     stego = stego_in(made.out)
     assert (stego.suffix == ".ply") == capabilities.standard
-    out = tmp_path / ("secret.ply" if capabilities.models else "secret.3dgs.safetensors")
+    out = tmp_path / (
+        "secret.3dgs.safetensors" if made.name in ("3dgs-decoder", "gs-hider") else "secret.ply"
+    )
     keyss.reveal(stego, companion=made.companion, out=out)
     assert isinstance(keyss.read_model(out), DecodedGaussians) != capabilities.models
     psnr = psnr_of_pictures(out, folders[1])
