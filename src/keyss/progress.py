@@ -172,7 +172,7 @@ class Wait:
 
     @property
     def left(self) -> float:
-        """Seconds left at the pace of the work that is done, else as estimated; below 0 if it takes longer."""
+        """Seconds left at the pace of the work so far, else as estimated; below 0 if it takes longer."""
         total = (self.at - self.start) / self.share if self.share else self.seconds
         return self.start + total - self.timer()
 

@@ -122,6 +122,11 @@ class RunFolder:
         elif in_use and resume:
             content = f"a finished run ({self.stage})" if self.stage in manifest.files else "something else"
             raise OutputError(f"{self.path} holds {content}, and no interrupted run that could be resumed")
+        elif in_use == {self.stage} and self.onto and not overwrite:
+            raise OutputError(
+                f"{self.path} has a finished {self.stage} already: `overwrite=True` replaces it and keeps "
+                "all other files"
+            )
         elif in_use and not overwrite:
             raise OutputError(
                 f"{self.path} exists: choose another folder, or `overwrite=True` to replace what keyss wrote "
