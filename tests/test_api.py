@@ -181,23 +181,9 @@ def test_command_line_matches_api(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         views=keyss.ViewOptions(24),
         out=tmp_path / "python",
     )
-    arguments = ["--cover", str(cover), "--secret", str(secret), "--width", "24", "--iterations", "2"]
-    arguments += ["--seed", "0"]
-    assert (
-        main(
-            [
-                "hide",
-                "--publish",
-                "converted",
-                "--fine-tune",
-                "always",
-                *arguments,
-                "-o",
-                str(tmp_path / "line"),
-            ]
-        )
-        == 0
-    )
+    options = "--publish converted --fine-tune always --width 24 --iterations 2 --seed 0"
+    paths = ("--cover", cover, "--secret", secret, "-o", tmp_path / "line")
+    assert main(["hide", *options.split(), *map(str, paths)]) == 0
     for name in ("private/config.json", "publish/model.ply"):
         assert (tmp_path / "line" / name).read_bytes() == (tmp_path / "python" / name).read_bytes(), name
     config = json.loads((tmp_path / "line" / "private" / "config.json").read_text())["options"]

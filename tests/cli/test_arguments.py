@@ -51,21 +51,9 @@ def test_secrets_are_paired_with_keys(keyss: Run, hide_calls: list[Any], tmp_pat
 
 def test_options_override_preset(keyss: Run, hide_calls: list[Any]) -> None:
     result = keyss(
-        *("hide", "--cover", "A", "--secret", "B", "-o", "out", "--preset", "quick", "--iterations", 7),
-        *(
-            "--max-gaussians",
-            80,
-            "--seed",
-            9,
-            "--method",
-            "keyss",
-            "--design",
-            "released",
-            "--mask",
-            "xyz,sc",
-        ),
-        *("--width", 20),
-        *("--background", 1, 0.5, 0, "--cover-model", "m.ply", "--resume", "--device", "cpu"),
+        "hide --cover A --secret B -o out --preset quick --iterations 7 --max-gaussians 80 --seed 9 "
+        "--method keyss --design released --mask xyz,sc --width 20 --background 1 0.5 0 --cover-model m.ply "
+        "--resume --device cpu"
     )
     assert result.status == 0, result.err
     _, options = hide_calls[0]

@@ -37,14 +37,6 @@ def test_example_and_common_options(keyss: Run, command: str) -> None:
     assert "nothing here" not in out
 
 
-@pytest.mark.parametrize("columns", [60, 80, 100, 120])
-def test_numbers_are_not_broken(keyss: Run, columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The parser breaks lines at commas."""
-    monkeypatch.setenv("COLUMNS", str(columns))
-    for command in COMMANDS:
-        assert not re.search(r"\d,\s*│?\n│?\s*\d", keyss(command, "--help").out)
-
-
 def test_hide_snapshot(keyss: Run) -> None:
     expected = Path(__file__).with_name("hide_carry_help.txt").read_text(encoding="utf-8")
     out = keyss("hide", "--method", "carry", "--help").out
