@@ -35,7 +35,6 @@ COMMANDS = {
     "view -o": ("view", STEGO, "-o", "{1}/page.html"),
     "render": ("render", STEGO, "-o", "{1}/turn.webp"),
     "evaluate": ("evaluate", "{0}/run", *KEY),
-    "audit --dry-run": ("audit", "{0}/run", *KEY, "--dry-run"),
 }
 pytestmark = pytest.mark.slow
 

@@ -32,10 +32,8 @@ def test_loss_is_the_difference_of_psnr(scene: Scene) -> None:
     """The secret is the cover, so every number is known; two seeds of one change give their mean."""
     model = random_gaussians(seed=0)
     changes = [random_pruning(0.5, seed) for seed in (0, 1)]
-    steps: list[tuple[int, int]] = []
-    rows = measure_robustness(
-        model, [Whole], [scene, scene], changes=changes, progress=lambda *step: steps.append(step)
-    )
+    shares: list[float] = []
+    rows = measure_robustness(model, [Whole], [scene, scene], changes=changes, share=shares.append)
     assert [(row.attack, row.seeds) for row in rows] == [("none", 1), ("random pruning", 2)]
     before = mean_psnr(model, scene.test, scene.background)
     assert rows[0].cover == rows[0].secrets[0] == ChangedQuality(before, 0)
@@ -43,7 +41,7 @@ def test_loss_is_the_difference_of_psnr(scene: Scene) -> None:
     assert rows[1].cover is not None
     assert (rows[1].cover.psnr, rows[1].cover.loss) == pytest.approx((after, before - after))
     assert rows[1].secrets == (rows[1].cover,)
-    assert steps == [(0, 300), (100, 300), (200, 300)]
+    assert shares == [0, 1 / 3, 2 / 3]
     assert measure_robustness(model, [Whole], [scene, scene], changes=changes) == rows
 
 
