@@ -13,8 +13,7 @@ import pytest
 from files.formats.examples import model_of
 from keyss.core import InputError
 from keyss.files import read_model, write_model
-from keyss.files.ply_summary import NEARLY_TRANSPARENT, summarise_ply
-from keyss.files.ply_table import model_names, ply_header
+from keyss.files.ply_table import NEARLY_TRANSPARENT, model_names, ply_header, summarise_ply
 
 VALUES = (np.nan, np.inf, -np.inf, 3e38, -3e38)  # sums of the last two overflow
 

@@ -79,21 +79,15 @@ def read_model(path: Path | str) -> Gaussians:
         return _read(file, path.name)
 
 
-def reads_as(path: Path, model: Gaussians) -> bool:
+def reads_as(path: Path | str, model: Gaussians, data: bytes | None = None) -> bool:
     """True if `read_model` gives `model`, to the bit, for a .ply; takes no memory for a second model.
 
-    Raises InputError as `read_model` does.
+    `data`: the content of the file, if it is not written yet. Raises InputError as `read_model` does.
     """
     if type(model) is not Gaussians or _for_writing(path) is not PLY:
         return False
-    with open_input(path) as file:
+    with open_input(Path(path)) if data is None else io.BytesIO(data) as file:
         return ply.holds(file, model)
-
-
-def holds(path: Path | str, data: bytes, model: Gaussians) -> bool:
-    """`reads_as` for a file at `path` that contains `data`."""
-    is_plain_model = type(model) is Gaussians and _for_writing(path) is PLY
-    return is_plain_model and ply.holds(io.BytesIO(data), model)
 
 
 def model_of_bytes(path: Path | str, data: bytes) -> Gaussians:

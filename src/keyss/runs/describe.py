@@ -15,7 +15,7 @@ from keyss.channels.names import Format
 from keyss.core.errors import InputError, UsageError
 from keyss.files.file_kinds import identify_file, is_training, is_unpacked_sog, model_file
 from keyss.files.inputs import is_standard
-from keyss.files.ply_summary import NEARLY_TRANSPARENT, summarise_ply
+from keyss.files.ply_table import NEARLY_TRANSPARENT, summarise_ply
 
 # Of a hidden model, by SH degree: `usual_size` of six models is 14 to 17, and 10 to 12.
 _BYTES_PER_GAUSSIAN = {3: 17, 0: 12}

@@ -15,6 +15,7 @@ from keyss.lab.robustness.changes import Change
 from keyss.lab.robustness.converters import converters
 from keyss.measure.hide_quality import in_cover
 from keyss.methods.hidden import HiddenScene
+from keyss.progress import Share
 
 PRUNED = (0.05, 0.10, 0.15, 0.25, 0.50)
 NOISE = (0.001, 0.01, 0.1)
@@ -74,14 +75,14 @@ def measure_robustness(
     changes: Sequence[Change] | None = None,
     max_views: int = 8,
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    share: Share | None = None,
 ) -> list[ChangeResult]:
     """PSNRs of cover and secrets after each of the `changes`; the first result is the unchanged model's.
 
     `changes`: by default `default_changes`, about 50; results of equal attack and strength are averaged.
-    `max_views`: test views per scene. `progress`: called with the finished and the total work in training
-    steps. Renders on the device of `stego`. Deterministic in `seed`. Raises UsageError unless there is one
-    opener per secret, KeyssError if a secret does not open in the unchanged model.
+    `max_views`: test views per scene. `share`: called with the share of the work that is done. Renders on the
+    device of `stego`. Deterministic in `seed`. Raises UsageError unless there is one opener per secret,
+    KeyssError if a secret does not open in the unchanged model.
     """
     cover, *secrets = scenes
     if len(openers) != len(secrets):
@@ -107,8 +108,8 @@ def measure_robustness(
     unchanged = Change("none", 0, "Nothing is changed.", lambda model: model)
     done, work = 0, sum(_STEPS_TO_MEASURE + alteration.steps for alteration in [unchanged, *changes])
     for alteration in [unchanged, *changes]:
-        if progress is not None:
-            progress(done, work)
+        if share is not None:
+            share(done / work)
         done += _STEPS_TO_MEASURE + alteration.steps
         result = ChangeResult(alteration.attack, alteration.strength, alteration.sentence)
         try:
