@@ -12,7 +12,7 @@ def test_dry_run(keyss: Run, workspace: Path, tmp_path: Path) -> None:
     scenes = scene_arguments(workspace)
     result = keyss("hide", "--publish", "converted", *scenes, "-o", tmp_path / "out", *SMALL, "--dry-run")
     assert result.status == 0, result.err
-    for words in ("capacity ", "time ", "memory ", "disk "):
+    for words in ("capacity ", "cost ", " of memory", " of disk"):
         assert words in result.out, words
     assert re.search(r"up to [5-9]\d\d Gaussians of SH degree 3", result.out)
     assert "appended to the cover's 100" in result.out
@@ -26,5 +26,5 @@ def test_dry_run(keyss: Run, workspace: Path, tmp_path: Path) -> None:
 def test_dry_run_of_a_fit(keyss: Run, workspace: Path, tmp_path: Path) -> None:
     result = keyss("fit", workspace / "a", "-o", tmp_path / "out", *SMALL, "--dry-run")
     assert result.status == 0, result.err
-    assert all(re.search(rf"^{word} +", result.out, re.M) for word in ("model", "training", "time", "memory"))
+    assert all(re.search(rf"^{word} +", result.out, re.M) for word in ("model", "training", "cost"))
     assert listing(tmp_path) == {}

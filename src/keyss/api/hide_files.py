@@ -7,14 +7,14 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from keyss.api.hide_arguments import HideResult, SecretFile
-from keyss.channels import Channel, Payload, open_payload
+from keyss.channels import open_payload
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
 from keyss.files.formats.ply import with_extras
 from keyss.files.inputs import as_text, read_file
 from keyss.files.models import read_model, reads_as
-from keyss.keys.encryption import MAX_PAYLOAD_BYTES, compressed_size
+from keyss.keys.encryption import MAX_PAYLOAD_BYTES
 from keyss.methods.hidden import HiddenFile
 from keyss.methods.method import MethodOptions
 from keyss.progress import Reporter
@@ -22,8 +22,6 @@ from keyss.rendering.orbit import is_model, psnr_between
 from keyss.runs.estimates import seconds_for
 from keyss.runs.files import STEGOS, PathLike, as_3dgs_model, stego_name
 from keyss.runs.folder import HIDE_FILES, RunFolder
-
-_MOST = 10  # times the estimated capacity; no channel holds more
 
 
 def hide_files(
@@ -46,12 +44,9 @@ def hide_files(
     with reporter.waiting("hiding", seconds):
         files, model = [_read(secret) for secret in secrets], as_3dgs_model(cover, "the cover")
         keyed = [(secret.key, file.payload()) for secret, file in zip(secrets, files, strict=True)]
-
-        def embed_in(channel: Channel) -> tuple[Gaussians, bool]:
-            _check_sizes(channel, model, [payload for _, payload in keyed])
-            return channel.prepare(model).embed(keyed), channel.survives
-
-        stego, survives = options.in_channel(model, embed_in)
+        stego, survives = options.in_channel(
+            model, lambda channel: (channel.prepare(model).embed(keyed), channel.survives)
+        )
         with folder.work() if folder else nullcontext():
             published = stego
             if folder:
@@ -62,21 +57,6 @@ def hide_files(
                 raise RuntimeError("the hidden files do not open again from the published file")
         psnr = psnr_between(model, stego)
     return HideResult(None if dry_run else stego, survives=survives, psnr=psnr)
-
-
-def _check_sizes(channel: Channel, cover: Gaussians, payloads: Sequence[Payload]) -> None:
-    """Raise UsageError for payloads that fit in no cover of this size, before the cover is examined."""
-    if channel.grows:
-        return
-    typical = channel.estimate_capacity(len(cover), cover.sh_degree).bytes
-    size = sum(len(payload.data) for payload in payloads)
-    if size > _MOST * typical:  # compressing takes longer
-        size = sum(compressed_size(payload.data) for payload in payloads)
-    if size > _MOST * typical:
-        raise UsageError(
-            f"a cover of {len(cover):,} Gaussians holds about {typical:,} bytes in the {channel.place}, and "
-            f"the given files take {size:,}"
-        )
 
 
 def _read(secret: SecretFile) -> HiddenFile:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from keyss.channels import APPENDED, Capacity, Channel, PreparedCover
+from keyss.channels import Capacity, Channel, PreparedCover
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.fitting.config import FitConfig
@@ -15,7 +14,7 @@ from keyss.rendering.orbit import Viewpoints
 
 _BITS_PER_GAUSSIAN = 150, 210  # of a secret that is not fitted yet, with the usual and the finest precision
 _FLAT_BITS = 90  # bits of an unfitted Gaussian of SH degree 0, with the usual precision
-_SAMPLE, _FAR_TOO_LARGE = 10_000, 1.5  # Gaussians of a sample; size / what can be appended
+_FAR_TOO_LARGE = 1.5  # size of a secret / what can be appended
 _TINY = 16  # Gaussians; secrets are not pruned to fewer
 
 
@@ -45,23 +44,6 @@ class SecretSize:
         return usual_size(self.model.with_sh_degree(0))
 
 
-def check_appended(model: Gaussians) -> None:
-    """Raise UsageError for a secret far too large for appended Gaussians, by a sample of it.
-
-    A sparse sample takes more bits for positions: log2 of the distance between its Gaussians.
-    """
-    step, most = len(model) // _SAMPLE, APPENDED.estimate_capacity(0, 0).bytes
-    if step < 2:
-        return
-    sample = model[::step]
-    size = len(model) * (usual_size(sample) / len(sample) - math.log2(step) / 8)
-    if size > _FAR_TOO_LARGE * most:
-        raise UsageError(
-            f"the secret takes about {size:,.0f} bytes, and {most:,} can be "
-            "appended; fewer Gaussians or a lower SH degree take less"
-        )
-
-
 @dataclass(frozen=True)
 class CarryCapacity:
     """The capacity of a cover: exact for a prepared cover, estimated for one not fitted yet."""
@@ -88,6 +70,13 @@ class CarryCapacity:
 
         Raises UsageError if the cover is too small.
         """
+        most = self.payloads.bytes
+        for secret in secrets:
+            if self.payloads.grows and secret.model is not None and secret.usual > _FAR_TOO_LARGE * most:
+                raise UsageError(
+                    f"the secret takes about {secret.usual:,} bytes, and {most:,} can be appended; fewer "
+                    "Gaussians or a lower SH degree take less"
+                )
         limits = self.payloads.limits([secret.finest for secret in secrets])
         counts = [
             min(secret.count, secret.count * limit // (secret.flat if flat else secret.usual))

@@ -16,7 +16,7 @@ from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.schedule import boost_of
 from keyss.kernels.memory import release
-from keyss.methods.carry.capacity import CarryCapacity, SecretSize, check_appended
+from keyss.methods.carry.capacity import CarryCapacity, SecretSize
 from keyss.methods.carry.carry_options import FINE_TUNING, CarryOptions
 from keyss.methods.codec.model_bytes import decode
 from keyss.methods.codec.precision import encode_to_size, finest_size
@@ -94,10 +94,6 @@ class CarryMethod:
         """Select the channel, and the secrets that are pruned and fine-tuned; see `Method`."""
         cover, *secrets = sources
         chosen = replace(options, publish="converted") if earlier and earlier.grows else options
-        if chosen.publish == "converted" and chosen.channel == "appended":
-            for secret in secrets:
-                if secret.given is not None:
-                    check_appended(secret.given)
         secret_sizes = [SecretSize.of(secret.given, options.fit) for secret in secrets]
 
         def fit_in(channel: Channel) -> tuple[CarryCapacity, list[int]]:
