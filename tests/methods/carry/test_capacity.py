@@ -88,6 +88,6 @@ def test_pruning_for_other_secrets_warns() -> None:
 
 def test_secret_too_large_to_append(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(appended_channel, "MAX_BYTES", 20_000)
-    with pytest.raises(UsageError, match="bytes, and [0-9,]+ can be appended; fewer Gaussians"):
+    with pytest.raises(UsageError, match=r"bytes, and [0-9,]+ can be appended; fewer Gaussians"):
         _prepare(CarryOptions(publish="converted"), trained_like(500), trained_like(4000, 1))
     _prepare(CarryOptions(publish="converted"), trained_like(500), trained_like(600, 1))
