@@ -13,7 +13,6 @@ from keyss.methods.codec.precision import finest_size, prune_to_size, usual_size
 from keyss.rendering.orbit import Viewpoints
 
 _BITS_PER_GAUSSIAN = 150, 210  # of a secret that is not fitted yet, with the usual and the finest precision
-_FLAT_BITS = 90  # bits of an unfitted Gaussian of SH degree 0, with the usual precision
 _FAR_TOO_LARGE = 1.5  # size of a secret / what can be appended
 _TINY = 16  # Gaussians; secrets are not pruned to fewer
 
@@ -25,23 +24,15 @@ class SecretSize:
     count: int  # Gaussians
     usual: int  # bytes of its payload with the usual precision
     finest: int
-    sh_degree: int
-    model: Gaussians | None  # None: not fitted yet
+    fitted: bool
 
     @staticmethod
     def of(model: Gaussians | None, fit: FitConfig) -> SecretSize:
         """The size of `model`, or of what `fit` will give."""
         if model is not None:
-            return SecretSize(len(model), usual_size(model), finest_size(model), model.sh_degree, model)
+            return SecretSize(len(model), usual_size(model), finest_size(model), True)
         usual, finest = (fit.max_gaussians * bits // 8 for bits in _BITS_PER_GAUSSIAN)
-        return SecretSize(fit.max_gaussians, usual, finest, fit.sh_degree, None)
-
-    @property
-    def flat(self) -> int:
-        """Like `usual`, at SH degree 0; takes as long again for large models."""
-        if self.model is None:
-            return self.count * _FLAT_BITS // 8
-        return usual_size(self.model.with_sh_degree(0))
+        return SecretSize(fit.max_gaussians, usual, finest, False)
 
 
 @dataclass(frozen=True)
@@ -63,23 +54,21 @@ class CarryCapacity:
         prepared = channel.prepare(cover)
         return CarryCapacity(len(cover), cover.sh_degree, channel, prepared.capacity, prepared)
 
-    def sizes(self, secrets: Sequence[SecretSize], *, flat: bool = False) -> list[int]:
-        """The number of Gaussians of each secret that fit; an estimate where not all do.
+    def sizes(self, secrets: Sequence[SecretSize]) -> list[int]:
+        """The number of Gaussians of each secret that fit at their SH degree; an estimate where not all do.
 
-        They keep their SH degree or, if `flat`, have degree 0.
-
-        Raises UsageError if the cover is too small.
+        Raises UsageError if the cover is too small, or a secret far too large for appended Gaussians.
         """
         most = self.payloads.bytes
         for secret in secrets:
-            if self.payloads.grows and secret.model is not None and secret.usual > _FAR_TOO_LARGE * most:
+            if self.payloads.grows and secret.fitted and secret.usual > _FAR_TOO_LARGE * most:
                 raise UsageError(
                     f"the secret takes about {secret.usual:,} bytes, and {most:,} can be appended; fewer "
                     "Gaussians or a lower SH degree take less"
                 )
         limits = self.payloads.limits([secret.finest for secret in secrets])
         counts = [
-            min(secret.count, secret.count * limit // (secret.flat if flat else secret.usual))
+            min(secret.count, secret.count * limit // secret.usual)
             for secret, limit in zip(secrets, limits, strict=True)
         ]
         if any(count < min(_TINY, secret.count) for count, secret in zip(counts, secrets, strict=True)):

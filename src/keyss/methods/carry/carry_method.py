@@ -102,9 +102,9 @@ class CarryMethod:
             chosen_by_user = options.publish or options.format
             for size, count in zip(secret_sizes, counts, strict=True):
                 hopeless = count < min(_HOPELESS, _HOPELESS_SHARE * size.count)
-                known = cover.given is not None and size.model is not None
+                known = cover.given is not None and size.fitted
                 if hopeless or (known and not chosen_by_user and count < _MIN_SHARE * size.count):
-                    most = "" if size.model else "up to "
+                    most = "" if size.fitted else "up to "
                     raise UsageError(
                         f"a secret of {most}{size.count:,} Gaussians would be cut down to about {count:,}"
                     )
@@ -124,20 +124,15 @@ class CarryMethod:
         ]
         usual = [size.usual for size in secret_sizes]
         appended = APPENDED.appended_count(usual) if capacity.payloads.grows else 0  # about
-        prunes = any(count < size.count for count, size in zip(counts, secret_sizes, strict=True))
-        kept, flat = (
-            sum(
-                count if count == size.count else int(_PLANNED_SHARE * count)
-                for size, count in zip(secret_sizes, of, strict=True)
-            )
-            for of in (counts, capacity.sizes(secret_sizes, flat=True) if prunes else counts)
-        )
+        kept = [
+            count if count == size.count else int(_PLANNED_SHARE * count)
+            for size, count in zip(secret_sizes, counts, strict=True)
+        ]
         plan = Plan(
             gaussians=capacity.gaussians + appended,
             sh_degree=capacity.sh_degree,
             secret_gaussians=sum(secret.count for secret in secret_sizes),
-            capacity=kept,
-            flat_capacity=flat,
+            capacity=sum(kept),
             notes=(_note(capacity, appended),),
         )
         return Prepared(
