@@ -51,8 +51,8 @@ class Revealed:
         """Raise InputError if so little is left that renders would be nearly empty."""
         if self.file is None and self.recovered.share < MIN_LEFT:
             raise InputError(
-                f"{count_of(self.recovered)}, too few to render (expected at least {MIN_LEFT:.0%}): the others "
-                f"{_CAUSE}; use the file as it was published"
+                f"{count_of(self.recovered)}, too few to render (expected at least {MIN_LEFT:.0%}): the "
+                f"others {_CAUSE}; use the file as it was published"
             )
 
 
