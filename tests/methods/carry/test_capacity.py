@@ -16,7 +16,7 @@ from keyss.channels.appended import appended_channel
 from keyss.channels.foreign import EXACT_BYTES
 from keyss.core import KeyssWarning, UsageError
 from keyss.methods import Context, Prepared, Source, registry
-from keyss.methods.carry.capacity import CarryCapacity
+from keyss.methods.carry.carry_method import CarryCapacity
 from keyss.rendering import Viewpoints, scene_of_model
 
 KEY = "a key of many characters: 93hXmQ2"

@@ -8,18 +8,18 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
-from keyss.channels import APPENDED, Channel, Payload, PreparedCover, open_payload
+from keyss.channels import APPENDED, Capacity, Channel, Payload, PreparedCover, open_payload
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
+from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.schedule import boost_of
 from keyss.kernels.memory import release
-from keyss.methods.carry.capacity import CarryCapacity, SecretSize
 from keyss.methods.carry.carry_options import FINE_TUNING, CarryOptions
 from keyss.methods.codec.model_bytes import decode
-from keyss.methods.codec.precision import encode_to_size, finest_size
+from keyss.methods.codec.precision import encode_to_size, finest_size, prune_to_size, usual_size
 from keyss.methods.hidden import Frame, HiddenScene, Recovered
 from keyss.methods.method import (
     Capabilities,
@@ -44,6 +44,9 @@ _PLANNED_SHARE = 0.95  # Gaussians planned / estimate: those that are kept take 
 # Least shares of a secret's Gaussians. Public models fine-tuned with fewer are below 30 dB; with fewer than
 # the second, and than so many Gaussians, below 20 dB or as far from the plain model as empty renders.
 _MIN_SHARE, _HOPELESS_SHARE, _HOPELESS = 1 / 6, 1 / 100, 500
+_BITS_PER_GAUSSIAN = 150, 210  # of a secret that is not fitted yet, with the usual and the finest precision
+_FAR_TOO_LARGE = 1.5  # size of a secret / what can be appended
+_TINY = 16  # Gaussians; secrets are not pruned to fewer
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,78 @@ class CarriedSecret(HiddenScene):
 
     def fingerprint(self) -> str:
         return hashlib.sha256(self.gaussians.means.numpy().tobytes()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class SecretSize:
+    """The size of a secret, at most if it is not fitted yet."""
+
+    count: int  # Gaussians
+    usual: int  # bytes of its payload with the usual precision
+    finest: int
+    fitted: bool
+
+    @staticmethod
+    def of(model: Gaussians | None, fit: FitConfig) -> SecretSize:
+        """The size of `model`, or of what `fit` will give."""
+        if model is not None:
+            return SecretSize(len(model), usual_size(model), finest_size(model), True)
+        usual, finest = (fit.max_gaussians * bits // 8 for bits in _BITS_PER_GAUSSIAN)
+        return SecretSize(fit.max_gaussians, usual, finest, False)
+
+
+@dataclass(frozen=True)
+class CarryCapacity:
+    """The capacity of a cover: exact for a prepared cover, estimated for one not fitted yet."""
+
+    gaussians: int  # Gaussians of the cover
+    sh_degree: int  # SH degree of the published model
+    channel: Channel
+    payloads: Capacity
+    prepared: PreparedCover | None = None  # None: not fitted yet
+
+    @staticmethod
+    def of(channel: Channel, cover: Gaussians | None, fit: FitConfig) -> CarryCapacity:
+        """The capacity of `cover`, or of what `fit` will give. Raises UsageError if there is none."""
+        if cover is None:
+            size = fit.max_gaussians, fit.sh_degree
+            return CarryCapacity(*size, channel, channel.estimate_capacity(*size))
+        prepared = channel.prepare(cover)
+        return CarryCapacity(len(cover), cover.sh_degree, channel, prepared.capacity, prepared)
+
+    def sizes(self, secrets: Sequence[SecretSize]) -> list[int]:
+        """The number of Gaussians of each secret that fit at their SH degree; an estimate where not all do.
+
+        Raises UsageError if the cover is too small, or a secret far too large for appended Gaussians.
+        """
+        most = self.payloads.bytes
+        for secret in secrets:
+            if self.payloads.grows and secret.fitted and secret.usual > _FAR_TOO_LARGE * most:
+                raise UsageError(
+                    f"the secret takes about {secret.usual:,} bytes, and {most:,} can be appended; fewer "
+                    "Gaussians or a lower SH degree take less"
+                )
+        limits = self.payloads.limits([secret.finest for secret in secrets])
+        counts = [
+            min(secret.count, secret.count * limit // secret.usual)
+            for secret, limit in zip(secrets, limits, strict=True)
+        ]
+        if any(count < min(_TINY, secret.count) for count, secret in zip(counts, secrets, strict=True)):
+            raise UsageError(
+                f"a cover of {self.gaussians:,} Gaussians is too small to hide {len(secrets)} "
+                f"{'secrets' if len(secrets) > 1 else 'secret'} in its {self.channel.place}"
+            )
+        return counts
+
+    def prune(self, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]) -> list[Gaussians]:
+        """The most visible Gaussians of each model that fit, or all; see `prune_to_size`.
+
+        Warns (KeyssWarning) if the models have less room than they would alone.
+        """
+        needed = list(map(finest_size, models))
+        self.payloads.warn_of_sharing(needed)
+        limits = self.payloads.limits(needed)
+        return [prune_to_size(*model) for model in zip(models, limits, viewpoints, strict=True)]
 
 
 class CarryMethod:
