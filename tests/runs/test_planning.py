@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import warnings
 from collections import namedtuple
 from dataclasses import replace
 from functools import partial
@@ -14,10 +15,12 @@ import torch
 
 import keyss
 from channels.lsb.trained_like import trained_like
+from files.formats.examples import model_of
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.core import OutputError
 from keyss.files import write_model
 from keyss.runs import planning
+from keyss.runs.estimates import gaussians_in
 from keyss.runs.folder import RunFolder
 from methods.keyss.small import small
 from tiny_scenes import tiny_scene
@@ -104,3 +107,17 @@ def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             verb(tmp_path / "cover.ply", secrets, method="carry", out=tmp_path / "a" / "run")
     assert set(asked) == {tmp_path.resolve()}
     assert [path.name for path in tmp_path.iterdir()] == ["cover.ply"]
+
+
+def test_estimated_model_sizes(tmp_path: Path) -> None:
+    (tmp_path / "point_cloud/iteration_7").mkdir(parents=True)
+    inside = tmp_path / "point_cloud/iteration_7/point_cloud.ply"
+    write_model(inside, model_of(3000, 2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # the command warns of the chosen model, once
+        assert gaussians_in(tmp_path) == gaussians_in(inside) == 3000
+    for name in ("a.spz", "a.compressed.ply", "a.sog"):
+        write_model(tmp_path / name, model_of(20_000, 0))
+        assert 10_000 < gaussians_in(tmp_path / name) < 40_000
+    for name in ("-", "missing.ply", "a/b"):
+        assert gaussians_in(Path(name)) == 0
