@@ -231,12 +231,9 @@ def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -
     """Numbers of measures, or notes on them."""
     numbers: dict[str, float | str] = {}
     if parts := [name for name in names if name in PARTS]:
-        run = folder / RUN
-        manifest = read_manifest(run)
-        done = "audit" in manifest.files
-        resume = not done and manifest.running is not None
-        more: dict[str, Any] = {"device": trial.device, "overwrite": done, "resume": resume}
-        audited = audit(run, keys_of(trial, folder), only=parts, reporter=reporter, **more)
+        keys, done = keys_of(trial, folder), "audit" in read_manifest(folder / RUN).files
+        more: dict[str, Any] = {"device": trial.device, "overwrite": done, "reporter": reporter}
+        audited = audit(folder / RUN, keys, only=parts, **more)
         for part in parts:
             numbers |= flat(audited.sections[part].numbers, f"audit.{part}")
     if others := [name for name in names if name not in PARTS]:
