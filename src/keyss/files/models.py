@@ -150,8 +150,8 @@ def _write(file: BinaryIO, path: Path | str, model: Gaussians) -> None:
     model_format = _for_writing(path)
     if isinstance(model, DecodedGaussians) != (model_format is DECODED):
         raise UsageError(
-            f"cannot write {path}: {DECODED_SUFFIX}, which `keyss render` reads, is for models that a network "
-            "decodes; all others have other names, such as .ply"
+            f"cannot write {path}: {DECODED_SUFFIX}, which `keyss render` reads, is for models which a "
+            "network decodes; all others have other names, such as .ply"
         )
     try:
         if model_format is PLY:
