@@ -34,13 +34,7 @@ FORMATS = (
     ),
     ModelFormat("PLY", "a .ply", (".ply",), _PLY, magic=(b"ply",), in_page=True, is_exact=True),
     ModelFormat(
-        "SPZ",
-        "an SPZ model",
-        (".spz",),
-        "spz:SpzCodes",
-        magic=(b"NGSP",),
-        archive=(b"\x1f\x8b",),
-        in_page=True,
+        "SPZ", "an SPZ model", (".spz",), "spz:SpzCodes", (b"NGSP",), archive=(b"\x1f\x8b",), in_page=True
     ),
     ModelFormat("SOG", "an SOG model", (".sog",), "sog:SogCodes", archive=(b"PK\x03\x04",), in_page=True),
     ModelFormat("glTF", "a glTF file", (".glb",), "glb", magic=(b"glTF",)),

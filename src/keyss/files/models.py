@@ -148,15 +148,10 @@ def _for_writing(path: Path | str) -> ModelFormat:
 
 def _write(file: BinaryIO, path: Path | str, model: Gaussians) -> None:
     model_format = _for_writing(path)
-    if isinstance(model, DecodedGaussians) and model_format is not DECODED:
+    if isinstance(model, DecodedGaussians) != (model_format is DECODED):
         raise UsageError(
-            f"cannot write {path}: a network decodes what this model renders, which 3DGS files cannot hold; "
-            f"use a name that ends in {DECODED_SUFFIX}, which `keyss render` reads"
-        )
-    if model_format is DECODED and not isinstance(model, DecodedGaussians):
-        raise UsageError(
-            f"cannot write a 3DGS model as {path}: {DECODED_SUFFIX} is for models that a network decodes; "
-            "use a name that ends in .ply"
+            f"cannot write {path}: {DECODED_SUFFIX}, which `keyss render` reads, is for models which a "
+            "network decodes; all others have other names, such as .ply"
         )
     try:
         if model_format is PLY:

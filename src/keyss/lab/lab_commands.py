@@ -12,7 +12,6 @@ from keyss.cli.arguments import (
     KeyFiles,
     OutFolder,
     Overwrite,
-    Resume,
     Run,
     Width,
     check_exists,
@@ -50,12 +49,13 @@ def audit(
             "all",
         ),
     ] = (),
-    resume: Resume = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
     seed: Annotated[int, arg(metavar="N", help="Seed of all random numbers.")] = 0,
 ) -> None:
     """Audit a run: quality, stealth, attacks, robustness and speed; takes minutes.
+
+    Run the same command again to resume.
 
     example: keyss audit runs/hidden --key-file key.txt
 
@@ -76,7 +76,6 @@ def audit(
         seed=check_seed(seed),
         device=device,
         overwrite=overwrite,
-        resume=resume,
         reporter=progress.reporter(),
     )
     if progress.level >= 0:
@@ -170,11 +169,7 @@ def reproduce(
     table: Annotated[Positional[TableName], arg(help="Table of the paper.")],
     scenes: Annotated[
         Positional[tuple[Path, ...]],
-        arg(
-            metavar="[SCENE ...]",
-            help="Scenes; each hides the next one.",
-            help_behavior_hint="",
-        ),
+        arg(metavar="[SCENE ...]", help="Scenes; each hides the next one.", help_behavior_hint=""),
     ] = (),
     *,
     full: Annotated[

@@ -22,9 +22,9 @@ _SECONDS = {
     "verify": 1.2,
     "reveal": 6.0,
     "hide a file": 20.0,
-    "convert": 9.0,
-    "convert, checking a key": 21.0,
     "export": 1.0,
+    "convert": 12.0,
+    "convert, checking a key": 24.0,
     "render": 10.0,
     "prepare": 7.0,
 }

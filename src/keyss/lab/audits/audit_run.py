@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from keyss.core import InputError, Interrupted, UsageError, import_extra, signal_of
+from keyss.core import InputError, Interrupted, UsageError, import_extra
 from keyss.files import write_bytes
 from keyss.lab.audits.parts import PARTS, Part
 from keyss.lab.audits.record import Audit
@@ -46,7 +46,6 @@ def audit(
     seed: int = 0,
     device: Backend = "auto",
     overwrite: bool = False,
-    resume: bool = False,
     reporter: Reporter | None = None,
 ) -> Audit:
     """Measure quality, stealth, leaks, robustness and speed of a folder of `hide`.
@@ -55,9 +54,9 @@ def audit(
     compare with; at least 2, kept in `private/controls/`. `only`: names of parts, by default all.
 
     The folder gets `private/audit/` with pictures and `audit.json`, which is also returned, and
-    `private/report.md`. Other parts of an earlier audit with the same controls stay. `resume` continues an
-    interrupted audit after its finished parts. Raises KeyssError (BackendError without the extra `audit`),
-    and Interrupted on Ctrl-C.
+    `private/report.md`. Other parts of an earlier audit with the same controls stay. The same call continues
+    an interrupted audit after its finished parts. Raises KeyssError (BackendError without the extra `audit`)
+    and KeyboardInterrupt.
     """
     if controls < 2:
         raise UsageError(f"expected at least 2 plain models to compare with, got {controls}")
@@ -73,18 +72,23 @@ def audit(
     fit = opened.config.options.fit
     seeds = tuple(fit.seed_of(f"control {seed + index}") for index in range(controls))
     earlier = _earlier(opened.folder, seeds)
-    adds = not resume and earlier is not None and not earlier.sections.keys() & parts.keys()
+    adds = earlier is not None and not earlier.sections.keys() & parts.keys()
+    running = read_manifest(opened.folder).running
+    resume = running is not None and running.stage == "audit" and not overwrite
     folder = RunFolder(
         opened.folder,
         "audit",
         settings | {"payloads": opened.config.payloads},
         onto=KEPT,
         writes=(AUDIT, REPORT),
-        overwrite=overwrite or (adds and read_manifest(opened.folder).running is None),
+        overwrite=overwrite or (adds and running is None),
         resume=resume,
     )
-    with folder.work(), _resumable(folder.checkpoints):
-        subject.fit_controls(seeds, folder, reporter)
+    with folder.work():
+        try:
+            subject.fit_controls(seeds, folder, reporter)
+        except Interrupted as error:  # its message says how to resume a fit
+            raise KeyboardInterrupt(*error.args) from error
         record, pictures = folder.checkpoints / "audit.json", folder.checkpoints / "pictures"
         cover, *secrets = opened.sources
         result = Audit(
@@ -103,7 +107,7 @@ def audit(
         for number, (name, part) in enumerate(parts.items(), start=1):
             if name in result.sections:
                 continue
-            seconds = part.work.time(subject.view_seconds, len(subject.stego))
+            seconds = part.views * subject.view_seconds
             with reporter.waiting(f"audit, {number} of {len(parts)}: {name}", seconds) as share:
                 section, shown = part.measure(subject, seed, share)
             pictures.mkdir(exist_ok=True)
@@ -144,15 +148,3 @@ def _chosen(only: Sequence[str], method: str) -> dict[str, Part]:
             f"{' and '.join(impossible)} measure: leave out `only`, or name other parts"
         )
     return {name: part for name, part in parts.items() if name in (only or parts)}
-
-
-@contextmanager
-def _resumable(checkpoints: Path) -> Iterator[None]:
-    """Turn any interrupt into Interrupted, which says how to continue."""
-    try:
-        yield
-    except Interrupted:
-        raise
-    except KeyboardInterrupt as error:
-        saved = any(not path.name.startswith(".") for path in checkpoints.iterdir())
-        raise Interrupted(checkpoints if saved else None, None, signal_of(error)) from error

@@ -19,7 +19,6 @@ from keyss.progress import Share
 
 PRUNED = (0.05, 0.10, 0.15, 0.25, 0.50)
 NOISE = (0.001, 0.01, 0.1)
-_STEPS_TO_MEASURE = 100  # training steps that take as long as measuring a change
 SEEDS = 3  # repetitions per random removal; results vary by a dB or two
 
 # Opens a secret in a stego model on the CPU; raises KeyssError if it does not open.
@@ -106,11 +105,9 @@ def measure_robustness(
     results: dict[tuple[str, float], list[ChangeResult]] = {}
     before: list[float] = []
     unchanged = Change("none", 0, "Nothing is changed.", lambda model: model)
-    done, work = 0, sum(_STEPS_TO_MEASURE + alteration.steps for alteration in [unchanged, *changes])
-    for alteration in [unchanged, *changes]:
+    for index, alteration in enumerate([unchanged, *changes]):
         if share is not None:
-            share(done / work)
-        done += _STEPS_TO_MEASURE + alteration.steps
+            share(index / (1 + len(changes)))
         result = ChangeResult(alteration.attack, alteration.strength, alteration.sentence)
         try:
             changed = alteration(stego)
