@@ -13,10 +13,9 @@ import pytest
 
 from keyss.channels import LowBitsReader, Message, Payload, Shards
 from keyss.core import Gaussians
-from keyss.keys import DerivedKey
 
 
-def seen_by_holder(stego: Gaussians, key: DerivedKey) -> dict[str, float]:
+def seen_by_holder(stego: Gaussians, key: str) -> dict[str, float]:
     """Numbers of rows of messages and shards, and how they lie in the file."""
     payload, messages, shards = _opened(stego, key)
     where = np.flatnonzero(shards)
@@ -29,7 +28,7 @@ def seen_by_holder(stego: Gaussians, key: DerivedKey) -> dict[str, float]:
     return found
 
 
-def _opened(stego: Gaussians, key: DerivedKey) -> tuple[Payload, list[int], npt.NDArray[np.bool_]]:
+def _opened(stego: Gaussians, key: str) -> tuple[Payload, list[int], npt.NDArray[np.bool_]]:
     """The payload, places of each message that hold it, and which Gaussians seem to hold shards."""
     messages: list[int] = []
     shards: list[npt.NDArray[np.bool_]] = []
@@ -49,5 +48,5 @@ def _opened(stego: Gaussians, key: DerivedKey) -> tuple[Payload, list[int], npt.
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Message, "read", read_message)
         patch.setattr(Shards, "decrypt", decrypt_shards)
-        payload = LowBitsReader.of(stego).extract(key)
-    return payload, messages, shards[0]
+        payload = LowBitsReader.of(stego).open(key)
+    return payload, messages[-2:], shards[-1]  # those before are of stale salts

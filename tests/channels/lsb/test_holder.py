@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from channels.lsb.holder import seen_by_holder
-from channels.lsb.payloads import embed_payloads
-from channels.lsb.trained_like import keys, trained_like
+from channels.lsb.trained_like import trained_like
 from keyss.channels import LOW_BITS, Payload
 from keyss.core import KeyssWarning
 
@@ -22,10 +21,9 @@ def _seen(own: float, others: Sequence[float], draw: int) -> dict[str, float]:
     """What the holder of the first key sees; sizes in quarters of the carriers at the least depth."""
     prepared = LOW_BITS.prepare(trained_like(COVER, seed=draw))
     quarter = prepared.capacity.shares[0][1]
-    payloads = [Payload("test", os.urandom(int(count * quarter))) for count in (own, *others)]
-    keyed = [(keys(10 * draw + index), payload) for index, payload in enumerate(payloads)]
-    stego = embed_payloads(prepared, keyed, os.urandom(32))
-    return seen_by_holder(stego, keys(10 * draw)[prepared.fresh_salts[0]])
+    sizes = [int(count * quarter) for count in (own, *others)]
+    payloads = [(str(index), Payload("test", os.urandom(size))) for index, size in enumerate(sizes)]
+    return seen_by_holder(prepared.embed(payloads), "0")
 
 
 @pytest.mark.parametrize("others", [[1], [1.9, 1]])

@@ -9,9 +9,9 @@ import pytest
 import torch
 from hypothesis import given, strategies as st
 
-from channels.lsb.payloads import embed_derived
-from channels.lsb.trained_like import keys, trained_like
-from keyss.channels import LOW_BITS, LowBitsReader, chance_of_bits, read_low_bits, usable_carriers
+from channels.lsb.payloads import embed, extract
+from channels.lsb.trained_like import trained_like
+from keyss.channels import LOW_BITS, chance_of_bits, read_low_bits, usable_carriers
 from keyss.channels.lsb.bits import DEPTHS, Layout, used_words, write_low_bits
 from keyss.channels.lsb.equal_steps import Steps
 from keyss.channels.lsb.trailing_zeros import count_trailing_zeros, least_exponent
@@ -54,7 +54,7 @@ def test_models_with_trailing_zeros_and_new_bits_look_alike(rounded: list[Gaussi
     """The sum that told all carried models from plain ones, as somebody counts who knows the optimiser."""
     size = int(0.95 * min(LOW_BITS.prepare(model).capacity.bytes for model in rounded))
     stegos = [
-        embed_derived(model, [(keys(seed), np.random.default_rng(seed).bytes(size))], bytes([seed] * 32))
+        embed(model, [("a key", np.random.default_rng(seed).bytes(size))], bytes([seed] * 32))
         for seed, model in enumerate(rounded)
     ]
     plain = [small_even_numbers(model) for model in rounded]
@@ -147,12 +147,11 @@ def test_clones_stay_as_they_are() -> None:
 def test_quaternions_of_unit_length_stay_so() -> None:
     model = trained_like(4000, 6)
     unit = replace(model, quats=torch.nn.functional.normalize(model.quats, dim=1))
-    own = keys()
-    stego = embed_derived(unit, [(own, b"secret")])
+    stego = embed(unit, [("a key", b"secret")])
     assert Layout.of(unit) == Layout.of(stego) == Layout(3, quats=False)
     assert torch.equal(stego.quats, unit.quats)
     assert read_low_bits(stego).shape[1] == 49
-    assert LowBitsReader.of(stego).extract(own[0]).data == b"secret"  # type: ignore[union-attr]
+    assert extract(stego, "a key") == b"secret"
 
 
 def test_unit_quaternions_and_half_precision_of_a_few_stay_as_they_are() -> None:
