@@ -9,25 +9,13 @@ from dataclasses import replace
 from functools import cache
 from typing import Literal
 
-import numpy as np
 import pytest
 from scipy.stats import ks_2samp
 
+from channels.lsb.holder import seen_by_holder
 from channels.lsb.trained_like import trained_like
-from keyss.channels import (
-    LEAST,
-    LOW_BITS,
-    LowBitsCover,
-    LowBitsReader,
-    Parameters,
-    Payload,
-    Shards,
-    read_low_bits,
-)
-from keyss.channels.container import key_secret
-from keyss.channels.lsb.low_bits_capacity import codewords_of, key_message, parameter_message
+from keyss.channels import LEAST, LOW_BITS, LowBitsCover, Payload
 from keyss.core import KeyssWarning
-from keyss.keys import DerivedKey
 
 HIDINGS = 40
 Size = int | Literal["quarter", "half"]  # bytes, or as many as fit into so many of the carriers
@@ -40,35 +28,14 @@ def _prepared() -> LowBitsCover:
 
 
 def _seen(sizes: Sequence[Size]) -> list[float]:
-    """What the holder of the first key can count of its own rows, and of all others together."""
+    """What the holder of the first key can count."""
     prepared = _prepared()
     shares = dict(zip(("quarter", "half"), prepared.capacity.shares, strict=False))
     payloads = [
         (str(index), Payload("test", os.urandom(size if isinstance(size, int) else shares[size][1])))
         for index, size in enumerate(sizes)
     ]
-    stego, ids, layout = prepared.embed(payloads), prepared.carriers.ids, prepared.layout
-    low = read_low_bits(stego, LEAST, layout)
-    key = DerivedKey.of("0", LowBitsReader.of(stego).salts[0])
-    message = key_message(key_secret(key), low.shape[1])
-    data_key = message.read(ids, low.__getitem__)
-    places, contents = message.write(ids, data_key)
-    own_key = (low[places, :16] == contents).all(axis=1)
-    message = parameter_message(data_key, low.shape[1])
-    packed = message.read(ids, low.__getitem__)
-    places, contents = message.write(ids, packed)
-    own_parameters = (low[places, : contents.shape[1]] == contents).all(axis=1)
-    found = Parameters.unpack(packed, data_key)
-    own = Shards(data_key, codewords_of(found, layout), True).decrypt(ids, low)[0]
-    return [
-        float(own_key.sum()),
-        float(own_parameters.sum()),
-        float(own.sum()),
-        float(np.flatnonzero(own).mean()),
-        float(np.diff(np.flatnonzero(own)).var()),
-        float((own[1:] & own[:-1]).sum()),
-        float(low[~own].mean()),
-    ]
+    return list(seen_by_holder(prepared.embed(payloads), "0").values())
 
 
 def _least_chance(alone: list[list[float]], beside: list[list[float]]) -> float:
