@@ -109,7 +109,7 @@ def test_reader_in_other_engines(chromium: Any, stego: Path, tmp_path: Path, eng
         modules.mkdir(exist_ok=True)
         (modules / name).symlink_to(WEB / "node_modules" / name)
     (modules / "keyss-reader").symlink_to(tmp_path)
-    shutil.copy(stego, modules.parent)
+    shutil.copy(stego, modules.parent / "model.ply")
     page = chromium.new_page()
     with serving(modules.parent) as address:
         page.goto(f"{address}{engine}.html")

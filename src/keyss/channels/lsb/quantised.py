@@ -1,9 +1,8 @@
 """The channel in the quantised values of a `.spz`, `.sog` or compressed `.ply`, or of a decoded model.
 
-The slots are blocks of last bits (see `wet_paper`), which are never lost or reordered. The first gives the
-salt. A secret takes consecutive blocks, cyclically: its parameters, then its sealed payload. A reader
-decrypts parameters in all blocks and keeps those with the right check. Other blocks hold noise, so the number
-of secrets does not show, and all arrangements are equally likely.
+The slots are blocks of last bits (see `wet_paper`), which are never lost or reordered. A secret takes
+consecutive blocks, cyclically. Other blocks hold noise, so the number of secrets does not show, and all
+arrangements are equally likely.
 """
 
 from __future__ import annotations
@@ -92,15 +91,9 @@ class QuantisedCover:
         free = writable_levels(ordered, places, fixed_axes(codes), _digest(codes))
         cover = QuantisedCover(ordered, places, free, own_hash, model)
         if len(cover.ids) < MIN_BLOCKS or cover.width < LEAST_BYTES:
-            why = "it has too few Gaussians"
-            if len(cover.ids) >= MIN_BLOCKS:
-                why = (
-                    f"{cover.dry.mean():.0%} of the last bits can change unnoticed, and each block of "
-                    f"{wet_paper.BLOCK:,} needs {8 * LEAST_BYTES} such bits"
-                )
             raise UsageError(
                 f"a cover of {len(codes):,} Gaussians has no room for secrets in the quantised values of "
-                f"{codes.name} files: {why}"
+                f"{codes.name} files: {int(cover.dry.sum()):,} last bits can change unnoticed"
             )
         return cover
 

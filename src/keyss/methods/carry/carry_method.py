@@ -274,13 +274,13 @@ def embed_models(
     """
     viewpoints, capacity = viewpoints or [*map(Viewpoints.around, models)], cover.capacity
     needed = list(map(finest_size, models))
-    capacity.warn_of_sharing(needed)
+    limits = capacity.limits(needed, warn=True)
     counts, degrees = [*map(len, models)], [model.sh_degree for model in models]
     payloads = [
         Payload(
             CarryOptions.method, encode_to_size(models.pop(0), limit, short=capacity.grows, viewpoints=views)
         )
-        for limit, views in zip(capacity.limits(needed), viewpoints, strict=True)
+        for limit, views in zip(limits, viewpoints, strict=True)
     ]
     release()
     stego = cover.embed(list(zip(keys, payloads, strict=True)), entropy=entropy)
