@@ -23,7 +23,7 @@ from keyss.channels.container import Payload, SaltedReader
 from keyss.channels.foreign import COARSE_BYTES, coarse_foreign, coarse_record
 from keyss.channels.mixing import random_order
 from keyss.channels.reed_solomon import Codewords
-from keyss.core.arrays import Bits, Doubles, Integers
+from keyss.core.arrays import Bits, Doubles, Integers, doubles
 from keyss.core.errors import UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
@@ -126,7 +126,7 @@ class AppendedReader(SaltedReader):
         if candidates.sum() < pilots.MIN // 4:
             return None
         faint = model.detach().to("cpu")[torch.from_numpy(candidates)]
-        colours, steps = words.colours_of(faint), words.scale_steps(faint)
+        colours, steps = words.colours_of(faint), doubles(faint.log_scales) / words.SCALE_STEP
         few = np.random.default_rng(0).permutation(len(faint))[:_SAMPLE]
         for shifts in (words.likely_shifts(steps), _shifts_with_pilots(steps[few], colours[few])):
             best: tuple[pilots.PilotFit, Integers] | None = None
@@ -202,15 +202,10 @@ def _shifts_with_pilots(steps: Doubles, colours: Integers) -> Iterator[float]:
 
 
 def _words(data_key: bytes, codewords: Codewords, sealed: bytes) -> Bits:
-    """Words [N, words.WORD_BITS] of the headers and packets of a sealed payload."""
-    width, needed = codewords.width, codewords.count * codewords.k
+    """Words [N, WORD_BITS] of the headers, with noise as data, and packets of a sealed payload."""
+    width, needed = codewords.width, np.full(words.HEADERS, codewords.count * codewords.k, np.uint64)
     noise = np.frombuffer(stream(data_key, "header-noise", words.HEADERS * width), np.uint8)
+    header_key, key = expand(data_key, f"header/{width}", 32), expand(data_key, "packets", 32)
+    headers = words.write_packets(header_key, needed, noise.reshape(words.HEADERS, width))
     numbers = np.arange(codewords.shards, dtype=np.uint64)
-    return np.concatenate(
-        [
-            words.write_header(
-                expand(data_key, f"header/{width}", 32), needed, noise.reshape(words.HEADERS, width)
-            ),
-            words.write_packets(expand(data_key, "packets", 32), numbers, codewords.encode(sealed)),
-        ]
-    )
+    return np.concatenate([headers, words.write_packets(key, numbers, codewords.encode(sealed))])

@@ -182,7 +182,7 @@ class QuantisedCover:
     def _with_bits(self, bits: Bits, entropy: bytes) -> Codes:
         """The quantised values with new last `bits` of all levels."""
         columns: dict[str, list[Levels]] = {}
-        parts = np.split(bits, np.cumsum([field.total_bits for field in self.fields])[:-1])
+        parts = np.split(bits, np.cumsum([field.bits.sum() for field in self.fields])[:-1])
         for field, free, field_bits in zip(self.fields, self.free, parts, strict=True):
             ties = random_fractions(entropy, f"codes/ties/{field.name}/{field.column}", len(free)) - 0.5
             levels = np.where(free, field.with_bits(field_bits, ties), field.levels)
