@@ -25,7 +25,6 @@ from keyss.core import (
     KeyssError,
     KeyssWarning,
     Similarity,
-    UsageError,
     WrongKeyError,
 )
 from keyss.files import read_model, write_model
@@ -140,19 +139,6 @@ def test_a_wrong_key_takes_as_many_derivations_as_a_right_one(cover: Gaussians, 
         except WrongKeyError:
             assert key != KEY
     assert derived.call_count == 1
-
-
-def test_two_secrets_each_with_its_key(cover: Gaussians) -> None:
-    payloads = [Payload("file", bytes(100)), Payload("carry", DATA)]
-    with pytest.warns(KeyssWarning, match="other secrets"):
-        stego = embedded(cover, list(zip(("one key", "another"), payloads, strict=True)))
-    reader = AppendedReader.of(stego)
-    assert reader is not None
-    assert [reader.open("one key"), reader.open("another")] == payloads
-    with pytest.raises(UsageError, match="same key"):
-        embedded(cover, [("one key", payloads[0]), ("one key", payloads[1])])
-    with pytest.raises(UsageError, match="at least one"):
-        embedded(cover, [])
 
 
 def test_no_two_files_share_anything(cover: Gaussians) -> None:

@@ -73,9 +73,8 @@ def test_round_trip_of_lower_degrees(degree: int, unit: bool) -> None:
     assert extract(stego[order], KEY) == PAYLOAD[:1500]
 
 
-def test_the_same_entropy_gives_the_same_bits_and_other_payloads_others(plain: Gaussians) -> None:
+def test_other_payloads_of_the_same_entropy_give_independent_bits(plain: Gaussians) -> None:
     stego = embed(plain, [(KEY, PAYLOAD)], bytes(32))
-    assert embed(plain, [(KEY, PAYLOAD)], bytes(32)).digest() == stego.digest()
     for other in (embed(plain, [(KEY, PAYLOAD[:-1] + b"!")], bytes(32)), embed(plain, [(KEY, PAYLOAD)])):
         same = (read_low_bits(other, 4) == read_low_bits(stego, 4))[usable_carriers(plain)].mean()
         assert same == pytest.approx(1 / 256, abs=2e-3)  # as between independent random bytes
@@ -148,17 +147,6 @@ def test_survives_splat_transform(
     write_model(tmp_path / "in.ply", stego)
     copy = splat_transform(tmp_path / "in.ply", tmp_path / "out.ply")
     assert extract(read_model(copy), KEY) == PAYLOAD
-
-
-def test_two_secrets_open_with_their_own_keys_only(plain: Gaussians) -> None:
-    model = trained_like(4500, seed=5)
-    stego = embed(model, [("one key", b"first"), ("another", PAYLOAD)])
-    assert extract(stego, "one key") == b"first"
-    assert extract(stego, "another") == PAYLOAD
-    with pytest.raises(WrongKeyError):
-        extract(stego, KEY)
-    with pytest.raises(UsageError, match="same key"):
-        embed(model, [(KEY, b"a"), (KEY, b"b")])
 
 
 def _neighbours(key: str) -> list[str]:
