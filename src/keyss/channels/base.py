@@ -6,10 +6,9 @@ is published determines its channel (`publishing`); readers try all channels.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 from keyss.channels.container import Payload, warn_of_others
 from keyss.core.gaussians import Gaussians
@@ -82,20 +81,14 @@ class PreparedCover(Protocol):
         """
 
 
-class Channel(ABC):
+@dataclass
+class Channel:
     """A place for bits in a model."""
 
     place: str  # in messages: "low bits", "quantised values of spz" and so on
-    survives: ClassVar[bool] = False  # True if secrets survive conversion to other formats
-    grows: ClassVar[bool] = False  # see `Capacity`
-
-    @abstractmethod
-    def prepare(self, cover: Gaussians) -> PreparedCover:
-        """Find the carriers. Raises UsageError for a cover without capacity, or if changes would be visible.
-
-        Raises OutputError for a cover that the published format cannot hold.
-        """
-
-    @abstractmethod
-    def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
-        """Estimate the capacity of a cover that is not fitted yet."""
+    # Finds the carriers of a cover. Raises UsageError for one without capacity, or if changes would be
+    # visible, OutputError for one that the published format cannot hold.
+    prepare: Callable[[Gaussians], PreparedCover]
+    estimate_capacity: Callable[[int, int], Capacity]  # of so many Gaussians of an SH degree, not fitted yet
+    survives: bool = False  # True if secrets survive conversion to other formats
+    grows: bool = False  # see `Capacity`

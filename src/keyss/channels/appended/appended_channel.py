@@ -48,39 +48,21 @@ _VISIBLE_SECRETS = (
 )
 
 
-class Appended(Channel):
-    """The channel; see `keyss.channels.base.Channel`."""
-
-    place = "appended Gaussians"
-    survives = True
-    grows = True
-
-    def prepare(self, cover: Gaussians) -> AppendedCover:
-        """See `Channel`. Raises UsageError for a cover too far from the origin for float32."""
-        words.check_place(words.own_frame(cover))
-        return AppendedCover(cover)
-
-    def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
-        shares = [(1.0, MAX_BYTES)]
-        return Capacity.of_sealed(_OVERHEAD, shares, lambda count: MAX_BYTES // count, grows=True)
-
-    def appended_count(self, sizes: Sequence[int]) -> int:
-        """The number of Gaussians appended for payloads of these bytes of compressed data, at most."""
-        return _padded_count([_codewords_for(size + _OVERHEAD, len(sizes)) for size in sizes])
-
-
-APPENDED = Appended()
-
-
 @dataclass(frozen=True)
 class AppendedCover:
     """Any cover; see `keyss.channels.base.PreparedCover`."""
 
     cover: Gaussians
 
+    @staticmethod
+    def of(cover: Gaussians) -> AppendedCover:
+        """Raises UsageError for a cover too far from the origin for float32."""
+        words.check_place(words.own_frame(cover))
+        return AppendedCover(cover)
+
     @property
     def capacity(self) -> Capacity:
-        return APPENDED.estimate_capacity(len(self.cover), self.cover.sh_degree)
+        return _capacity(len(self.cover), self.cover.sh_degree)
 
     def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
         """The cover followed by the appended Gaussians. Warns if there is more than one secret."""
@@ -108,6 +90,19 @@ class AppendedCover:
         ordered = np.concatenate(parts)[random_order(secret, "appended/order", total)]
         added = words.to_gaussians(words.sort_by_rotation(ordered), to_world, model.sh_degree)
         return Gaussians.cat([model, added])
+
+
+def _capacity(gaussians: int, sh_degree: int) -> Capacity:
+    """The same for all covers."""
+    return Capacity.of_sealed(_OVERHEAD, [(1.0, MAX_BYTES)], lambda count: MAX_BYTES // count, grows=True)
+
+
+APPENDED = Channel("appended Gaussians", AppendedCover.of, _capacity, survives=True, grows=True)
+
+
+def appended_count(sizes: Sequence[int]) -> int:
+    """The number of Gaussians appended for payloads of these bytes of compressed data, at most."""
+    return _padded_count([_codewords_for(size + _OVERHEAD, len(sizes)) for size in sizes])
 
 
 @dataclass(frozen=True)

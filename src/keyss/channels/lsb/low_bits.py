@@ -49,13 +49,18 @@ from keyss.keys.derivation import MASTER_BYTES, DerivedKey, expand, fill, stream
 Part = tuple[int, Integers, Bytes]  # a depth, rows of the model, and what is written into each
 
 
-class LowBits(Channel):
-    """The channel in the low bits of floats; see `keyss.channels.base.Channel`."""
+@dataclass(frozen=True)
+class LowBitsCover:
+    """A cover and its usable Gaussians; see `keyss.channels.base.PreparedCover`."""
 
-    place = "low bits"
+    cover: Gaussians
+    layout: Layout
+    carriers: Carriers
+    salt_rows: Integers  # [S] rows of the salts' Gaussians, in order
 
-    def prepare(self, cover: Gaussians) -> LowBitsCover:
-        """See `Channel`. Raises UsageError for low bits that are few or not random, and for stale salts."""
+    @staticmethod
+    def of(cover: Gaussians) -> LowBitsCover:
+        """Raises UsageError for low bits that are few or not random, and for stale salts."""
         layout = Layout.of(cover)
         carriers = Carriers.of(cover, layout)
         rows = salt_rows(cover, carriers.ids, layout)
@@ -67,22 +72,6 @@ class LowBits(Channel):
                 "made it could try keys in advance"
             )
         return LowBitsCover(cover, layout, carriers, rows)
-
-    def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
-        return LowBitsCapacity.of(gaussians, Layout(sh_degree)).for_payloads()
-
-
-LOW_BITS = LowBits()
-
-
-@dataclass(frozen=True)
-class LowBitsCover:
-    """A cover and its usable Gaussians; see `keyss.channels.base.PreparedCover`."""
-
-    cover: Gaussians
-    layout: Layout
-    carriers: Carriers
-    salt_rows: Integers  # [S] rows of the salts' Gaussians, in order
 
     @cached_property
     def capacity(self) -> Capacity:
@@ -178,6 +167,13 @@ class LowBitsCover:
                     parts.append((LEAST, rows[free[rows]], contents[free[rows]]))
                 free[rows] = False
         return parts, data_keys
+
+
+def _estimated_capacity(gaussians: int, sh_degree: int) -> Capacity:
+    return LowBitsCapacity.of(gaussians, Layout(sh_degree)).for_payloads()
+
+
+LOW_BITS = Channel("low bits", LowBitsCover.of, _estimated_capacity)
 
 
 @dataclass(frozen=True)

@@ -47,29 +47,25 @@ _ATTEMPTS = 30  # attempts to solve all blocks; one fails for at most one cover 
 _BITS_PER_GAUSSIAN = 18  # approximate capacity
 
 
-class QuantisedChannel(Channel):
+def quantised_channel(format: str, decoded: Decoded | None = None) -> Channel:
     """The channel in the quantised values of `format`, `spz`, `sog` or `compressed-ply`.
 
-    Their file is published, or the model that was `decoded` from them.
+    Their file is published, and a model that was read from such a file keeps its values. With `decoded`, its
+    model is published, and the cover is this model, perhaps with fewer harmonics.
     """
 
-    def __init__(self, format: str, decoded: Decoded | None = None) -> None:
-        self.format, self.decoded = format, decoded
-        self.place = f"quantised values of {format}"
-        if decoded:
-            self.place = f"values of the {format} file that the cover was decoded from"
+    def prepare(cover: Gaussians) -> QuantisedCover:
+        if decoded is None:
+            return QuantisedCover.of(QUANTISED[format].of(cover))
+        return QuantisedCover.of(decoded.codes, replace(decoded, model=cover.detach().to("cpu")))
 
-    def prepare(self, cover: Gaussians) -> QuantisedCover:
-        """See `Channel`. A model that was read from a file of this format keeps its values.
-
-        With `decoded`, the cover is its model, perhaps with fewer harmonics.
-        """
-        if self.decoded is None:
-            return QuantisedCover.of(QUANTISED[self.format].of(cover))
-        return QuantisedCover.of(self.decoded.codes, replace(self.decoded, model=cover.detach().to("cpu")))
-
-    def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
+    def estimate(gaussians: int, sh_degree: int) -> Capacity:
         return _capacity(gaussians * _BITS_PER_GAUSSIAN // 8, wet_paper.BLOCK // 8)
+
+    place = f"quantised values of {format}"
+    if decoded:
+        place = f"values of the {format} file that the cover was decoded from"
+    return Channel(place, prepare, estimate)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from keyss.channels import APPENDED, Capacity, Channel, PreparedCover
+from keyss.channels import APPENDED, Capacity, Channel, PreparedCover, appended_count
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.fitting.config import FitConfig
@@ -117,4 +117,4 @@ class CarryCapacity:
         """Approximate number of Gaussians by which the model grows."""
         if not self.payloads.grows:
             return 0
-        return APPENDED.appended_count([secret.usual for secret in secrets])
+        return appended_count([secret.usual for secret in secrets])
