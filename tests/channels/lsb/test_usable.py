@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, strategies as st
 
 from channels.lsb.payloads import embed, extract
 from channels.lsb.trained_like import trained_like
@@ -19,7 +18,6 @@ from keyss.channels.lsb.equal_steps import Steps
 from keyss.channels.lsb.trailing_zeros import count_trailing_zeros, least_exponent
 from keyss.channels.lsb.usable import MAX_SEPARATION, chance_of_lattice
 from keyss.core import Gaussians, UsageError
-from keyss.core.arrays import frequent
 
 STEP = 2.0**-12  # scale of the last steps of the optimiser that rounds them
 MODELS = 16
@@ -96,21 +94,6 @@ def test_what_is_given_away_keeps_to_its_share(step: float) -> None:
     given_away = (even * (2 * forced) ** 2)[least:].sum()
     assert given_away <= MAX_SEPARATION
     assert least < 127 + np.log2(step) + 4  # not much more is left alone than has to be
-
-
-def test_trailing_zeros_are_counted_by_exponent() -> None:
-    numbers = np.array([[0.75], [1.0 + 2**-23], [1.0 + 2**-20], [-(2.0 + 2**-10)], [3.0]], np.float32)
-    counts = count_trailing_zeros(numbers.view(np.uint32))
-    assert counts.sum() == 5
-    assert counts[126, 12] == counts[127, 0] == counts[127, 3] == 1
-    assert counts[128, 12] == 2  # 12 or more
-
-
-@given(st.lists(st.integers(0, 40), max_size=90), st.integers(1, 5), st.sampled_from([np.uint32, np.uint64]))
-def test_frequent_values_are_those_that_counting_finds(values: list[int], times: int, kind: type) -> None:
-    words = np.array(values, kind)[:, None]
-    found, counts = np.unique(words, return_counts=True)
-    assert np.array_equal(frequent(words, times), found[counts >= times])
 
 
 def test_the_chance_of_uniform_bits_is_one_and_that_of_others_is_small() -> None:
