@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from keyss.channels import APPENDED, Capacity, Channel, PreparedCover, appended_count
+from keyss.channels import APPENDED, Capacity, Channel, PreparedCover
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.fitting.config import FitConfig
@@ -36,10 +36,6 @@ class SecretSize:
             return SecretSize(len(model), usual_size(model), finest_size(model), model.sh_degree, model)
         usual, finest = (fit.max_gaussians * bits // 8 for bits in _BITS_PER_GAUSSIAN)
         return SecretSize(fit.max_gaussians, usual, finest, fit.sh_degree, None)
-
-    @property
-    def fitted(self) -> bool:
-        return self.model is not None
 
     @property
     def flat(self) -> int:
@@ -112,9 +108,3 @@ class CarryCapacity:
         needed = list(map(finest_size, models))
         limits = self.payloads.limits(needed, warn=True)
         return [prune_to_size(*model) for model in zip(models, limits, viewpoints, strict=True)]
-
-    def appended(self, secrets: Sequence[SecretSize]) -> int:
-        """Approximate number of Gaussians by which the model grows."""
-        if not self.payloads.grows:
-            return 0
-        return appended_count([secret.usual for secret in secrets])
