@@ -195,10 +195,10 @@ def convert(
     import keyss
     from keyss.cli.tables import print_conversion
     from keyss.progress import waiting
-    from keyss.runs.estimates import seconds_to_convert
+    from keyss.runs.estimates import seconds_for
 
     given = given_keys(key_file)
-    with waiting(f"converting {model.name}", seconds_to_convert(model, out, len(given))):
+    with waiting(f"converting {model.name}", (1 + len(given)) * seconds_for("convert", model)):
         conversion = keyss.convert(
             model,
             out,

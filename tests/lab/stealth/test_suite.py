@@ -64,10 +64,7 @@ def of_plain(seed: int) -> dict[str, Statistic]:
         ),
         (
             lambda seed: normalised(plain(seed)),
-            (
-                "invariants: quaternions of unit length",
-                "invariants: quaternions of nearly unit length",
-            ),
+            ("invariants: quaternions of unit length", "invariants: quaternions of nearly unit length"),
         ),
     ],
     ids=["rounded", "grey", "siblings", "normalised"],

@@ -107,7 +107,7 @@ def audit(
         for number, (name, part) in enumerate(parts.items(), start=1):
             if name in result.sections:
                 continue
-            seconds = part.work.time(subject.view_seconds, len(subject.stego))
+            seconds = part.views * subject.view_seconds
             with reporter.waiting(f"audit, {number} of {len(parts)}: {name}", seconds) as share:
                 section, shown = part.measure(subject, seed, share)
             pictures.mkdir(exist_ok=True)

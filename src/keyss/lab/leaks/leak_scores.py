@@ -48,9 +48,7 @@ class LeakScores:
     def evidence(self) -> float:
         """The maximum ratio of a leak's scores to their limits; above 1 the secret's shapes are visible."""
         return max(
-            self.psnr_fitted / PSNR_LIMIT,
-            self.ssim_fitted / SSIM_LIMIT,
-            self.gradient / GRADIENT_LIMIT,
+            self.psnr_fitted / PSNR_LIMIT, self.ssim_fitted / SSIM_LIMIT, self.gradient / GRADIENT_LIMIT
         )
 
     def __sub__(self, other: LeakScores) -> LeakScores:
@@ -126,10 +124,7 @@ class AttackResult:
 
 @torch.no_grad()
 def look_for_secret(
-    stego: Gaussians,
-    controls: Sequence[Gaussians],
-    secret: Scene,
-    attacks: Sequence[Attack],
+    stego: Gaussians, controls: Sequence[Gaussians], secret: Scene, attacks: Sequence[Attack]
 ) -> tuple[list[AttackResult], dict[str, Tensor]]:
     """Score attacks by their renders from the secret's test cameras against its photos.
 

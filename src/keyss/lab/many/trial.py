@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from itertools import zip_longest
 from math import isfinite
@@ -158,13 +158,8 @@ def cost_of_trial(trial: Trial, folder: Path, read: Callable[[str, ViewOptions],
     cost = hide(**arguments, dry_run=True, reporter=Reporter()).cost
     assert cost is not None  # a dry run always has a cost
     elsewhere = [seconds for seconds, model in zip_longest(cost.fit_seconds, trial.models) if model]
-    measures = _seconds_of(trial.measures, cost.view_seconds, trial.options.fit.max_gaussians)
-    return replace(cost, seconds=cost.seconds - sum(elsewhere) + measures)
-
-
-def _seconds_of(measures: Sequence[str], view: float, gaussians: int) -> float:
-    """About the seconds of measures; `view`: see `Cost.view_seconds`, `gaussians`: of the published model."""
-    return sum((PARTS.get(name) or MEASURES[name]).work.time(view, gaussians) for name in measures)
+    views = sum((PARTS.get(name) or MEASURES[name]).views for name in trial.measures)
+    return replace(cost, seconds=cost.seconds - sum(elsewhere) + views * cost.view_seconds)
 
 
 def keys_of(trial: Trial, folder: Path) -> list[str]:
@@ -241,10 +236,9 @@ def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -
         with reporter.waiting(f"opening {trial.name}", seconds_for("reveal", stego_in(folder / RUN))):
             controls = [read_model(_place(folder, path)).to(device) for path in trial.controls]
             subject = Subject(opened_run(trial, folder), device, controls)
-            view = subject.view_seconds
+            view_seconds = subject.view_seconds
         for name in others:
-            with reporter.waiting(f"{trial.name}: {name}", _seconds_of([name], view, len(subject.stego))):
-                numbers |= {
-                    f"{name}.{measure}": value for measure, value in MEASURES[name].numbers(subject).items()
-                }
+            measure = MEASURES[name]
+            with reporter.waiting(f"{trial.name}: {name}", measure.views * view_seconds):
+                numbers |= {f"{name}.{what}": value for what, value in measure.numbers(subject).items()}
     return numbers
