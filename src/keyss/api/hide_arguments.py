@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from itertools import combinations
 from pathlib import Path
 
 from keyss.api.model_frames import in_frame_of
@@ -85,7 +84,11 @@ def method_for(
         raise UsageError(f"the method {method.name} hides scenes only, no files")
     keys = [secret.key for secret in secrets]
     if method.capabilities.keys:
-        _check_keys(keys)
+        if len(set(map(normalized_key, keys))) < len(keys):
+            raise UsageError(
+                "two secrets have the same key, which could open only one of them: give each its own (see "
+                "`keyss keygen`)"
+            )
     elif any(keys):
         raise UsageError(
             f"the method {method.name} has no keys, as whoever has both files can see the secret: give none"
@@ -164,13 +167,3 @@ def _read_visible(source: PathLike | Gaussians | None, what: str) -> Gaussians |
     if model is not None and not (model.opacities >= DRAWN_OPACITY).any():
         raise UsageError(f"{what}'s model is invisible: all of its Gaussians are transparent")
     return model
-
-
-def _check_keys(keys: Sequence[str]) -> None:
-    """Raise UsageError for invalid keys, and for two keys that normalise to the same text."""
-    for (i, a), (j, b) in combinations(enumerate(map(normalized_key, keys), 1), 2):
-        if a == b:
-            raise UsageError(
-                f"secrets {i} and {j} have the same key, which could open only one of them: give each its "
-                "own (see `keyss keygen`)"
-            )

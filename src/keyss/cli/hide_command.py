@@ -39,41 +39,6 @@ _HOW_TO_PUBLISH = {False: "publish this file unchanged", True: "publish this fil
 
 
 @dataclass(frozen=True, kw_only=True)
-class Details:
-    """Plain models, the check of the result, and the channel of --publish converted."""
-
-    cover_model: Annotated[
-        Path | None, optional("FILE", "Plain 3DGS model of a cover of photos.", "fitted")
-    ] = None
-    secret_model: Annotated[
-        UseAppendAction[tuple[Path, ...]],
-        optional("FILE", "Plain 3DGS model of a secret of photos, one for each secret.", "fitted"),
-    ] = ()
-    min_psnr: Annotated[
-        float | None,
-        optional(
-            "DB",
-            "Fail if the PSNR of cover or secret to its plain model is below this, or, unless it is 0, no "
-            "better than that of empty renders.",
-            "20, and 25 for secrets that were pruned without fine-tuning",
-        ),
-    ] = None
-    bound: Annotated[
-        bool,
-        switch("Also fit upper bounds, plain 3DGS with equal Gaussians and steps; takes twice as long."),
-    ] = False
-    channel: Annotated[
-        Literal["appended", "colours"] | None,
-        optional(
-            "{appended,colours}",
-            "With --publish converted: appended Gaussians hold 6 MB, but are visible in the file; "
-            "colours hold less and show less.",
-            "appended",
-        ),
-    ] = None
-
-
-@dataclass(frozen=True, kw_only=True)
 class HideArguments:
     """The options of `keyss hide`; `keyss.cli.hide_command` adds those of the method."""
 
@@ -111,18 +76,44 @@ class HideArguments:
             "the cover's",
         ),
     ] = None
+    channel: Annotated[
+        Literal["appended", "colours"],
+        arg(
+            help="With --publish converted: appended Gaussians hold 6 MB, but are visible in the file; "
+            "colours hold less and show less."
+        ),
+    ] = "appended"
     out: OutFolder
     method: str
     preset: Annotated[
         PresetName, arg(help=f"{PRESETS} Method carry: 2.15 times the steps for secrets of photos.")
     ] = "default"
+    cover_model: Annotated[
+        Path | None, optional("FILE", "Plain 3DGS model of a cover of photos.", "fitted")
+    ] = None
+    secret_model: Annotated[
+        UseAppendAction[tuple[Path, ...]],
+        optional("FILE", "Plain 3DGS model of a secret of photos, one for each secret.", "fitted"),
+    ] = ()
+    min_psnr: Annotated[
+        float | None,
+        optional(
+            "DB",
+            "Fail if the PSNR of cover or secret to its plain model is below this, or, unless it is 0, no "
+            "better than that of empty renders.",
+            "20, and 25 for secrets that were pruned without fine-tuning",
+        ),
+    ] = None
+    bound: Annotated[
+        bool,
+        switch("Also fit upper bounds, plain 3DGS with equal Gaussians and steps; takes twice as long."),
+    ] = False
     dry_run: Annotated[bool, switch("Print the plan and estimates of time, memory and disk.")] = False
     resume: Resume = False
     overwrite: Overwrite = False
     device: Device = "auto"
     photos: OmitArgPrefixes[Photos] = PHOTOS
     training: OmitArgPrefixes[Training] = TRAINING
-    details: OmitArgPrefixes[Details] = Details()
     own: Any  # options of the method alone
 
 
@@ -137,9 +128,8 @@ def hide(args: HideArguments) -> None:
 
     example: keyss hide --cover cover.ply --secret-file letter.pdf --key-file key.txt -o runs/letter
     """
-    details = args.details
-    secrets = (*args.secret, *args.secret_file, *details.secret_model)
-    check_exists(args.cover, details.cover_model, *secrets, keys=args.key_file)
+    secrets = (*args.secret, *args.secret_file, *args.secret_model)
+    check_exists(args.cover, args.cover_model, *secrets, keys=args.key_file)
     if args.secret_file:
         if args.secret:
             raise UsageError("--secret and --secret-file do not go together: hide scenes or files, not both")
@@ -153,9 +143,9 @@ def hide(args: HideArguments) -> None:
         _secrets(args),
         method=_method_options(args),
         views=args.photos.views(),
-        cover_model=details.cover_model,
-        bound=details.bound,
-        min_psnr=details.min_psnr,
+        cover_model=args.cover_model,
+        bound=args.bound,
+        min_psnr=args.min_psnr,
         device=args.device,
         out=args.out,
         overwrite=args.overwrite,
@@ -221,7 +211,7 @@ def _secrets(args: HideArguments) -> list[Secret] | list[SecretFile]:
     if args.secret_file:
         given = keys(args.key_file, len(args.secret_file), new=True)
         return list(map(SecretFile, args.secret_file, given))
-    count, models = len(args.secret), args.details.secret_model
+    count, models = len(args.secret), args.secret_model
     for path in args.secret:
         if path.is_file() and not is_model_path(path):
             kind = identify_file(path)
@@ -248,8 +238,7 @@ def _method_options(args: HideArguments) -> MethodOptions:
         for name, value in vars(args.own).items()
         if value is not None and value is not False
     }
-    changes |= {"publish": args.publish, "format": args.format}
-    changes |= {"channel": args.details.channel} if args.details.channel else {}
+    changes |= {"publish": args.publish, "format": args.format, "channel": args.channel}
     preset = options_of(args.method).preset(args.preset, resolve_device(args.device).type)
     return replace(preset, **changes).with_fit(**args.training.schedule())
 

@@ -28,9 +28,8 @@ class CarryOptions(MethodOptions):
             "never."
         ),
     ] = "auto"
-    iterations: int | None = (
-        None  # steps of fine-tuning; None: FINE_TUNING per step of `fit`, fewer without photos
-    )
+    # Steps of fine-tuning; None: FINE_TUNING per step of `fit`, fewer without photos.
+    iterations: int | None = None
 
     def fits(self, scenes: int) -> list[FitConfig]:
         """See `MethodOptions`. Secrets by default train for the steps of fine-tuning in addition."""
