@@ -107,7 +107,7 @@ def hide(
     KeyssErrors too, and Interrupted on Ctrl-C.
 
     A list of `SecretFile` hides files in a model, with the default method; `cover_model`, `bound`,
-    `min_psnr`, `resume` and `views` are for scenes only.
+    `min_psnr`, `resume`, `views` and seeds are for scenes only.
     """
     began, target, reporter = time.monotonic(), resolve_device(device), reporter or default_reporter()
     chosen, options = method_for(method, preset, secrets, target.type)
