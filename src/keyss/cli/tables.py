@@ -224,25 +224,19 @@ def print_verification(checked: Verification) -> None:
 
 def print_conversion(out: Path, conversion: Conversion, *, dry_run: bool) -> None:
     """Print the cost of a conversion: size, PSNR of renders, and the parts of secrets that are left."""
-    file = sys.stderr if is_standard(out) else sys.stdout
-    if progress.level < 0 and not dry_run:
-        print(out, file=file)
-        return
     was = "" if conversion.bytes_before is None else f", {_size(conversion.bytes_before)} before"
     renders = "renders the same" if conversion.psnr >= 120 else f"renders at {conversion.psnr:.1f} dB PSNR"
     if math.isnan(conversion.psnr):
         renders = "renders are empty: the model is invisible"
-    size = f"{_size(conversion.bytes_after)}{was}"
-    print(f"{_name(out)}: {len(conversion.gaussians):,} Gaussians, {size}, {renders}", file=file)
+    lines = [f"{len(conversion.gaussians):,} Gaussians, {_size(conversion.bytes_after)}{was}, {renders}"]
     for number, secret in enumerate(conversion.secrets, 1):
         which = "the secret" if len(conversion.secrets) == 1 else f"the secret of key {number}"
         state = "survives" if secret.kept else f"is lost: {secret.after:,} {secret.unit} are left"
-        print(f"{which}, {secret.before:,} {secret.unit}, {state}", file=file)
+        lines.append(f"{which}, {secret.before:,} {secret.unit}, {state}")
     if not conversion.secrets and not conversion.keeps_low_bits:
         state = "would be" if dry_run else "are"
-        print(f"secrets of --publish unchanged, if any, {state} lost; --key-file checks one", file=file)
-    if dry_run:
-        print("dry run: nothing was written", file=file)
+        lines.append(f"secrets of --publish unchanged, if any, {state} lost; --key-file checks one")
+    print_written(out, "\n".join(lines + ["dry run: nothing was written"] * dry_run))
 
 
 def print_json(facts: object) -> None:
@@ -265,14 +259,8 @@ def print_files(folder: Path, names: Mapping[str, str]) -> None:
 
 def print_written(path: Path, text: str) -> None:
     """Print the path and the description of one result, to the standard error stream if it went to stdout."""
-    print(
-        path if progress.level < 0 else f"{_name(path)}: {text}",
-        file=sys.stderr if is_standard(path) else sys.stdout,
-    )
-
-
-def _name(path: Path) -> str:
-    return "standard output" if is_standard(path) else str(path)
+    name, file = ("standard output", sys.stderr) if is_standard(path) else (path, sys.stdout)
+    print(path if progress.level < 0 else f"{name}: {text}", file=file)
 
 
 def print_columns(rows: Sequence[tuple[str, str]]) -> None:
