@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from keyss.api.model_frames import in_frame_of
+from keyss.api.hide_arguments import in_frame_of
 from keyss.core import Gaussians, InputError, KeyssWarning, Similarity
 from keyss.files import write_model
 from keyss.fitting import mean_psnr
