@@ -71,7 +71,10 @@ def audit(
     settings = {"controls": controls, "only": only, "seed": seed, "device": subject.device.type}
     fit = opened.config.options.fit
     seeds = tuple(fit.seed_of(f"control {seed + index}") for index in range(controls))
-    earlier = _earlier(opened.folder, seeds)
+    earlier = None
+    with suppress(InputError):
+        found = read_audit(opened.folder)
+        earlier = found if found.controls == seeds else None
     adds = earlier is not None and not earlier.sections.keys() & parts.keys()
     running = read_manifest(opened.folder).running
     resume = running is not None and running.stage == "audit" and not overwrite
@@ -126,14 +129,6 @@ def audit(
         report = report_of(result, PICTURES.removeprefix(f"{PRIVATE}/"))
         folder.write({AUDIT: result, REPORT: report.encode(errors="replace"), **contents})
     return result
-
-
-def _earlier(run: Path, controls: tuple[int, ...]) -> Audit | None:
-    """The finished audit of a run with these controls, if there is one."""
-    with suppress(InputError):
-        found = read_audit(run)
-        return found if found.controls == controls else None
-    return None
 
 
 def _chosen(only: Sequence[str], method: str) -> dict[str, Part]:

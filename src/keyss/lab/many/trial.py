@@ -35,7 +35,7 @@ from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
 from keyss.runs import FitMetrics, HideMetrics, Manifest, read_manifest, read_record, record_bytes
 from keyss.runs.estimates import seconds_for
-from keyss.runs.files import METRICS, as_scene, stego_in
+from keyss.runs.files import METRICS, stego_in
 from keyss.runs.folder import PRIVATE, make_private
 from keyss.runs.open_run import HidingRun, open_run
 from keyss.runs.planning import Cost, cost_of_fit
@@ -136,11 +136,8 @@ def run_trial(trial: Trial, folder: Path, reporter: Reporter) -> Result:
     return result
 
 
-def cost_of_trial(trial: Trial, folder: Path, read: Callable[[str, ViewOptions], Scene] = as_scene) -> Cost:
-    """The cost of a trial, without the plain fits of other trials. Raises KeyssError.
-
-    `read`: `as_scene`, or one that remembers scenes that trials share.
-    """
+def cost_of_trial(trial: Trial, folder: Path, read: Callable[[str, ViewOptions], Scene]) -> Cost:
+    """The cost of a trial, without plain fits of other trials; `read` reads scenes. Raises KeyssError."""
     if isinstance(trial.options, FitConfig):
         return cost_of_fit(read(trial.cover, trial.views), trial.options, resolve_device(trial.device))
     keys = [f"key {index}" for index, _ in enumerate(trial.secrets)]
