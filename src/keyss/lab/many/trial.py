@@ -223,9 +223,8 @@ def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -
     """Numbers of measures, or notes on them."""
     numbers: dict[str, float | str] = {}
     if parts := [name for name in names if name in PARTS]:
-        keys, done = keys_of(trial, folder), "audit" in read_manifest(folder / RUN).files
-        more: dict[str, Any] = {"device": trial.device, "overwrite": done, "reporter": reporter}
-        audited = audit(folder / RUN, keys, only=parts, **more)
+        keys = keys_of(trial, folder)
+        audited = audit(folder / RUN, keys, only=parts, device=trial.device, reporter=reporter)
         for part in parts:
             numbers |= flat(audited.sections[part].numbers, f"audit.{part}")
     if others := [name for name in names if name not in PARTS]:
