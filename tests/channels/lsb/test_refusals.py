@@ -43,7 +43,7 @@ def test_files_that_no_cover_of_the_size_holds_are_refused_unseen(
 ) -> None:
     cover = trained_like(20_000, 0, 1)
     place = channel_for(publish, channel, None, cover)  # type: ignore[arg-type]
-    monkeypatch.setattr(type(place), "prepare", lambda *_: pytest.fail("the cover is examined"))
+    monkeypatch.setattr(place, "prepare", lambda _: pytest.fail("the cover is examined"))
     secret = SecretFile(os.urandom(4_000_000), "7Vw3-Qp: a key for a test", "noise")
     options = CarryOptions(publish=publish, channel=channel)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="a cover of 20,000 Gaussians holds about"):

@@ -106,6 +106,5 @@ class CarryCapacity:
         Warns (KeyssWarning) if the models have less room than they would alone.
         """
         needed = list(map(finest_size, models))
-        self.payloads.warn_of_sharing(needed)
-        limits = self.payloads.limits(needed)
+        limits = self.payloads.limits(needed, warn=True)
         return [prune_to_size(*model) for model in zip(models, limits, viewpoints, strict=True)]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
-from keyss.channels import APPENDED, Channel, Payload, PreparedCover, open_payload
+from keyss.channels import Channel, Payload, PreparedCover, appended_count, open_payload
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
@@ -127,7 +127,7 @@ class CarryMethod:
             )
         ]
         usual = [size.usual for size in secret_sizes]
-        appended = APPENDED.appended_count(usual) if capacity.payloads.grows else 0  # about
+        appended = appended_count(usual) if capacity.payloads.grows else 0  # about
         prunes = any(count < size.count for count, size in zip(counts, secret_sizes, strict=True))
         kept, flat = (
             sum(
@@ -251,13 +251,13 @@ def embed_models(
     """
     viewpoints, capacity = viewpoints or [*map(Viewpoints.around, models)], cover.capacity
     needed = list(map(finest_size, models))
-    capacity.warn_of_sharing(needed)
+    limits = capacity.limits(needed, warn=True)
     counts, degrees = [*map(len, models)], [model.sh_degree for model in models]
     payloads = [
         Payload(
             CarryOptions.method, encode_to_size(models.pop(0), limit, short=capacity.grows, viewpoints=views)
         )
-        for limit, views in zip(capacity.limits(needed), viewpoints, strict=True)
+        for limit, views in zip(limits, viewpoints, strict=True)
     ]
     release()
     stego = cover.embed(list(zip(keys, payloads, strict=True)), entropy=entropy)
