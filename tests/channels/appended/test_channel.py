@@ -203,10 +203,7 @@ def test_it_opens_from_every_format(suffix: str, stego: Gaussians, tmp_path: Pat
 
 @pytest.mark.parametrize("suffix", [".spz", pytest.param(".sog", marks=pytest.mark.slow), ".compressed.ply"])
 def test_it_opens_from_what_splat_transform_writes(
-    splat_transform: Callable[..., Path],
-    suffix: str,
-    stego: Gaussians,
-    tmp_path: Path,
+    splat_transform: Callable[..., Path], suffix: str, stego: Gaussians, tmp_path: Path
 ) -> None:
     write_model(tmp_path / "a.ply", stego)
     options = ["-i", "1"] if suffix == ".sog" else []

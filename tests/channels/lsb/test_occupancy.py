@@ -46,12 +46,7 @@ def _least_chance(alone: list[list[float]], beside: list[list[float]]) -> float:
 
 @pytest.mark.parametrize(
     ("own", "others"),
-    [
-        ("quarter", ["quarter"]),
-        (2000, ["quarter", 3000, 1]),
-        ("half", ["quarter", 100]),
-        (2000, ["half"]),
-    ],
+    [("quarter", ["quarter"]), (2000, ["quarter", 3000, 1]), ("half", ["quarter", 100]), (2000, ["half"])],
     ids=["quarters", "four secrets", "half beside quarters", "quarter beside half"],
 )
 def test_secrets_lie_as_if_they_were_alone(own: Size, others: list[Size]) -> None:
