@@ -66,9 +66,10 @@ def hide_files(
 
 def _check_sizes(channel: Channel, cover: Gaussians, payloads: Sequence[Payload]) -> None:
     """Raise UsageError for payloads that fit in no cover of this size, before the cover is examined."""
-    if channel.grows:
+    capacity = channel.estimate_capacity(len(cover), cover.sh_degree)
+    if capacity.grows:
         return
-    typical = channel.estimate_capacity(len(cover), cover.sh_degree).bytes
+    typical = capacity.bytes
     size = sum(len(payload.data) for payload in payloads)
     if size > _MOST * typical:  # compressing takes longer
         size = sum(compressed_size(payload.data) for payload in payloads)
