@@ -35,7 +35,7 @@ from keyss.channels import LOW_BITS
 from keyss.core import Gaussians, UsageError
 from keyss.fitting import FitConfig
 from keyss.lab import stealth_statistics
-from keyss.methods.carry.capacity import CarryCapacity
+from keyss.methods.carry.carry_method import CarryCapacity
 from keyss.rendering import Viewpoints
 from lab.stealth.candidates import candidate_scores
 from methods.carry import carried

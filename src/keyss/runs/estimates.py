@@ -24,6 +24,7 @@ _SECONDS = {
     "hide a file": 20.0,
     "export": 1.0,
     "convert": 12.0,
+    "convert, checking a key": 24.0,
     "render": 10.0,
     "prepare": 7.0,
 }

@@ -17,7 +17,6 @@ import torch
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.files.images import png_bytes
 from keyss.fitting.image_metrics import mean_quality, view_quality
 from keyss.lab.auc import Auc
 from keyss.lab.audits.record import Section, Table, Verdict, Word, auc_text, text_of
@@ -253,8 +252,7 @@ def leaks(subject: Subject, seed: int, share: Share) -> tuple[Section, Pictures]
         name = role_of(index, len(subject.scenes))
         results[name], shown = look_for_secret(subject.stego, subject.controls, secret, attacks)
         tables.append(Table((f"attack on the {name}", *heads), tuple(map(_leak_row, results[name]))))
-        for row in results[name]:
-            pictures[f"{name}, {row.attack}"] = png_bytes(shown[row.attack])
+        pictures[name] = contact_sheet(("published model", "plain model", "the secret"), shown)
     verdicts = leak_verdicts(results)
     return Section(verdicts=verdicts, tables=tables, numbers=_builtins(results)), pictures
 
@@ -395,8 +393,7 @@ PARTS = {
     "leaks": Part(
         "Leaks without the key",
         "Attacks on the published file, scored against the secret's test views after a fit of colours. In "
-        "brackets: the difference from the same attack on plain models; 0 shows nothing of the secret. "
-        "Pictures: published model, plain model, the secret.",
+        "brackets: the difference from the same attack on plain models; 0 shows nothing of the secret.",
         leaks,
         200,
     ),

@@ -35,7 +35,7 @@ from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
 from keyss.runs import FitMetrics, HideMetrics, Manifest, read_manifest, read_record, record_bytes
 from keyss.runs.estimates import seconds_for
-from keyss.runs.files import METRICS, as_scene, stego_in
+from keyss.runs.files import METRICS, stego_in
 from keyss.runs.folder import PRIVATE, make_private
 from keyss.runs.open_run import HidingRun, open_run
 from keyss.runs.planning import Cost, cost_of_fit
@@ -136,11 +136,8 @@ def run_trial(trial: Trial, folder: Path, reporter: Reporter) -> Result:
     return result
 
 
-def cost_of_trial(trial: Trial, folder: Path, read: Callable[[str, ViewOptions], Scene] = as_scene) -> Cost:
-    """The cost of a trial, without the plain fits of other trials. Raises KeyssError.
-
-    `read`: `as_scene`, or one that remembers scenes that trials share.
-    """
+def cost_of_trial(trial: Trial, folder: Path, read: Callable[[str, ViewOptions], Scene]) -> Cost:
+    """The cost of a trial, without plain fits of other trials; `read` reads scenes. Raises KeyssError."""
     if isinstance(trial.options, FitConfig):
         return cost_of_fit(read(trial.cover, trial.views), trial.options, resolve_device(trial.device))
     keys = [f"key {index}" for index, _ in enumerate(trial.secrets)]
@@ -226,9 +223,8 @@ def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -
     """Numbers of measures, or notes on them."""
     numbers: dict[str, float | str] = {}
     if parts := [name for name in names if name in PARTS]:
-        keys, done = keys_of(trial, folder), "audit" in read_manifest(folder / RUN).files
-        more: dict[str, Any] = {"device": trial.device, "overwrite": done, "reporter": reporter}
-        audited = audit(folder / RUN, keys, only=parts, **more)
+        keys = keys_of(trial, folder)
+        audited = audit(folder / RUN, keys, only=parts, device=trial.device, reporter=reporter)
         for part in parts:
             numbers |= flat(audited.sections[part].numbers, f"audit.{part}")
     if others := [name for name in names if name not in PARTS]:
