@@ -52,7 +52,7 @@ def _least_chance(alone: list[list[float]], beside: list[list[float]]) -> float:
 def test_secrets_lie_as_if_they_were_alone(own: Size, others: list[Size]) -> None:
     alone = [_seen([own]) for _ in range(HIDINGS)]
     beside = [_seen([own, *others]) for _ in range(HIDINGS)]
-    assert _least_chance(alone, beside) > 1e-5
+    assert _least_chance(alone, beside) > 1e-8  # of 40 tests in all: one false alarm in two million runs
 
 
 def test_who_is_crowded_is_warned_for_it_can_be_seen() -> None:
