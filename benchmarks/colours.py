@@ -26,6 +26,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -203,11 +204,9 @@ def _append_copy(share: float) -> Change:
 
     def apply(model: Gaussians) -> Gaussians:
         other = _move(1.3)(model[: int(share * len(model))])
-        return Gaussians.cat([model, Gaussians(*_parts(other))])
-
-    def _parts(other: Gaussians) -> tuple[torch.Tensor, ...]:
-        opacity_logits = -0.5 - 0.7 * other.opacity_logits
-        return other.means, other.quats, other.log_scales.flip(1), opacity_logits, -other.sh
+        logits, scales = -0.5 - 0.7 * other.opacity_logits, other.log_scales.flip(1)
+        mirrored = replace(other, log_scales=scales, opacity_logits=logits, sh=-other.sh)
+        return Gaussians.cat([model, mirrored])
 
     return apply
 

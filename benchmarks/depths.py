@@ -15,7 +15,6 @@ import argparse
 import math
 from pathlib import Path
 
-import keyss  # noqa: F401  before torch, see `ruff.toml`
 from keyss import FitConfig, Gaussians, read_model, write_model
 from keyss.channels import Carriers, Layout
 from keyss.core import UsageError

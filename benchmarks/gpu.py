@@ -7,15 +7,8 @@ gsplat's wheel has sources, which the first stage compiles for the GPU that is t
 minutes on 16 cores. A wheel compiled elsewhere (`TORCH_CUDA_ARCH_LIST=9.0 pip wheel --no-deps
 --no-build-isolation` of gsplat's source archive, with the same Python and torch) skips that.
 
-A machine without a network that has torch, numpy, numba, scipy, OpenCV, pillow, psutil, rich, safetensors,
-jaxtyping, ninja, pytest and hypothesis needs 21 MB more, for Python 3.12:
-
-    python -m pip download --no-deps --only-binary=:all: --python-version 3.12 --implementation cp \\
-      --platform manylinux_2_28_x86_64 --platform manylinux2014_x86_64 -c requirements/constraints.txt \\
-      -d wheels gsplat argon2-cffi argon2-cffi-bindings cffi cryptography docstring-parser filelock gsply \\
-      lazy-loader msgspec pycparser tyro typeguard zstandard zxcvbn
-    python -m pip install --no-index --no-deps --target site wheels/*.whl   # there
-    PYTHONPATH=site:src python benchmarks/gpu.py data --results out/gpu
+A machine without a network takes what it lacks from `pip download -c requirements/constraints.txt`, by `pip
+install --no-index --no-deps --target site *.whl` and `PYTHONPATH=site:src`.
 
 Stages are processes that follow one another: `kernels`, `tests`, `pilot`, which measures a step of every
 method at the full number of Gaussians and chooses how many fit into `--seconds`, `plain`, the designs of
@@ -306,11 +299,8 @@ class Clock(Reporter):
 
     def numbers(self) -> dict[str, float]:
         """Of the whole training; nothing without one."""
-        return (
-            {"steps, 1": self.steps, "s/step": (self.times[-1] - self.times[0]) / self.steps}
-            if self.steps
-            else {}
-        )
+        seconds = self.times[-1] - self.times[0] if self.steps else 0.0
+        return {"steps, 1": self.steps, "s/step": seconds / self.steps} if self.steps else {}
 
 
 if __name__ == "__main__":

@@ -14,11 +14,9 @@ import os
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
-import keyss  # noqa: F401  before torch, see `ruff.toml`
 from keyss.files import read_model
 
 import numpy as np
@@ -39,35 +37,22 @@ SHARE = 8  # secrets have at most 1 / SHARE of the cover's Gaussians
 SHOWN = 3  # single statistics in the table
 
 
-@dataclass(frozen=True)
-class Job:
-    index: int
-    scene: str
-    cover: str
-    others: tuple[str, ...]  # models of the secrets
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("plain", nargs="+", metavar="SCENE=FILE")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     options = parser.parse_args()
     named = [text.partition("=")[::2] for text in options.plain]
-    jobs = [
-        Job(index, scene, cover, tuple(other for each, other in named if each != scene))
-        for index, (scene, cover) in enumerate(named)
-    ]
+    others = [[other for each, other in named if each != scene] for scene, _ in named]
     started = time.monotonic()
     with ProcessPoolExecutor(options.workers, get_context("fork"), torch.set_num_threads, (1,)) as pool:
-        results = list(pool.map(_count_or_skip, jobs))
-    jobs, seen = zip(*[each for each in zip(jobs, results, strict=True) if each[1]], strict=True)
-    print(f"{len(jobs)} models of {len({job.scene for job in jobs})} scenes, ", end="")
+        seen = list(pool.map(_count_or_skip, range(len(named)), [cover for _, cover in named], others))
+    counted = [each for each in zip(named, seen, strict=True) if each[1]]
+    print(f"{len(counted)} models of {len({scene for (scene, _), _ in counted})} scenes, ", end="")
     print(f"{time.monotonic() - started:.0f} s\n")
     print("| detector | AUC | standard error | largest by chance |\n| --- | --- | --- | --- |")
     examples = Examples.of(
-        (each[beside], beside, job.scene, job.cover)
-        for job, each in zip(jobs, seen, strict=True)
-        for beside in (0, 1)
+        (each[beside], beside, scene, cover) for (scene, cover), each in counted for beside in (0, 1)
     )
     single, chance = single_detectors(examples, SHOWN)
     for row in learned_detectors(examples):
@@ -76,26 +61,22 @@ def main() -> None:
         print(f"| {row.name} | {row.auc:.3f} | {row.error:.3f} | {chance:.2f} |")
 
 
-def _count_or_skip(job: Job) -> list[dict[str, float]] | None:
+def _count_or_skip(index: int, path: str, others: list[str]) -> list[dict[str, float]] | None:
     """The first holder's statistics, alone and beside others; None for too small covers."""
-    try:
-        return _count(job)
-    except UsageError as error:
-        print(f"{job.cover}: {error}", file=sys.stderr)
-        return None
-
-
-def _count(job: Job) -> list[dict[str, float]]:
-    random = np.random.default_rng(job.index)
-    cover = read_model(job.cover)
+    random = np.random.default_rng(index)
+    cover = read_model(path)
     secrets = [
-        most_visible(read_model(path), int(random.integers(len(cover) // (2 * SHARE), len(cover) // SHARE)))
-        for path in random.choice(job.others, 1 + MAX_OTHERS)
+        most_visible(read_model(other), int(random.integers(len(cover) // (2 * SHARE), len(cover) // SHARE)))
+        for other in random.choice(others, 1 + MAX_OTHERS)
     ]
     found = []
     for count in (1, 1 + int(random.integers(1, MAX_OTHERS + 1))):
-        owned = [keys((1 + MAX_OTHERS) * job.index + each) for each in range(count)]
-        stego = embed_derived(cover, list(zip(owned, secrets[:count], strict=True)))
+        owned = [keys((1 + MAX_OTHERS) * index + each) for each in range(count)]
+        try:
+            stego = embed_derived(cover, list(zip(owned, secrets[:count], strict=True)))
+        except UsageError as error:
+            print(f"{path}: {error}", file=sys.stderr)
+            return None
         statistics = {name: each.value for name, each in stealth_statistics(stego).items()}
         found.append(seen_by_holder(stego, owned[0][0]) | statistics)
     return found

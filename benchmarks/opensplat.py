@@ -22,12 +22,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import struct
 import sys
 import tempfile
 from pathlib import Path
 
-import keyss  # noqa: F401  before torch, see `ruff.toml`
 from keyss import read_model
 from keyss.core import Scene
 from keyss.files import load_scene
@@ -38,6 +36,10 @@ import numpy as np
 import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from files.scene_files import PINHOLE, camera_bytes, counted, image_bytes, point_bytes
 
 SIZES = ("200,12000,200", "300,12000,400", "400,12000,150")
 TWO_THREADS = {"OMP_NUM_THREADS": "2", "NUMBA_NUM_THREADS": "2"}
@@ -83,8 +85,6 @@ def main() -> None:
                 rows.append({"size": size, "program": program, "steps": count, "psnr": psnr, **vars(cost)})
     options.results.parent.mkdir(parents=True, exist_ok=True)
     options.results.write_text(json.dumps(rows, indent=1) + "\n")
-    if torch.cuda.is_available():
-        print("This machine has a GPU: `benchmarks/gpu.py` measures it.")
 
 
 PLAIN = ("--keep-crs", "--cpu", "--num-downscales", "0")
@@ -99,24 +99,20 @@ def fit(scene: Path, out: Path, width: int, gaussians: int, steps: int) -> Cost:
 def write_colmap(scene: Scene, points: int, folder: Path) -> None:
     """The training photos as a binary COLMAP model, with evenly sampled points."""
     (folder / "images").mkdir(parents=True)
-    cameras, images = bytearray(), bytearray()
+    cameras, images = [], []
     for index, view in enumerate(scene.train):
         camera, name = view.camera, f"{index:05d}.png"
         Image.fromarray(view.image.numpy()).save(folder / "images" / name)
-        fx, fy, cx, cy = (float(camera.K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        cameras += struct.pack("<iiQQ4d", index + 1, 1, camera.width, camera.height, fx, fy, cx, cy)
+        params = [float(camera.K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2))]
+        cameras.append(camera_bytes(index + 1, PINHOLE[0], params, camera.width, camera.height))
         x, y, z, w = Rotation.from_matrix(camera.viewmat[:3, :3].double().numpy()).as_quat()
-        images += struct.pack("<i7di", index + 1, w, x, y, z, *camera.viewmat[:3, 3].tolist(), index + 1)
-        images += name.encode() + b"\0" + struct.pack("<Q", 0)
+        at = camera.viewmat[:3, 3].tolist()
+        images.append(image_bytes(index + 1, name, (w, x, y, z), at, index + 1, observations=0))
     every = np.linspace(0, len(scene.points) - 1, min(points, len(scene.points))).astype(int)
     positions, colors = scene.points[every].tolist(), scene.colors[every].tolist()
-    rows = (struct.pack("<Q3d3BdQ", 1, *at, *rgb, 0.0, 0) for at, rgb in zip(positions, colors, strict=True))
-    for file, count, data in (
-        ("cameras", len(scene.train), bytes(cameras)),
-        ("images", len(scene.train), bytes(images)),
-        ("points3D", len(every), b"".join(rows)),
-    ):
-        (folder / f"{file}.bin").write_bytes(struct.pack("<Q", count) + data)
+    rows = [point_bytes(1, at, rgb, track=()) for at, rgb in zip(positions, colors, strict=True)]
+    for file, records in (("cameras", cameras), ("images", images), ("points3D", rows)):
+        (folder / f"{file}.bin").write_bytes(counted(*records))
 
 
 if __name__ == "__main__":

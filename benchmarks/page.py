@@ -82,12 +82,7 @@ def server_of(count: int, folder: Path) -> ModelServer:
     """Serve the page and a stego model."""
     cover, secret = sized_model(count, 0), sized_model(count * 9 // 10, 1).with_sh_degree(0)
     hidden = keyss.hide(
-        cover,
-        [keyss.Secret(secret, KEY)],
-        method=CarryOptions(),
-        views=keyss.ViewOptions(32),
-        min_psnr=0,
-        out=folder / "run",
+        cover, [keyss.Secret(secret, KEY)], views=keyss.ViewOptions(32), min_psnr=0, out=folder / "run"
     )
     print(f"{len(hidden.stego):,} Gaussians carry {len(secret):,}", flush=True)
     server = ModelServer(folder / "run/publish/model.ply")
@@ -124,11 +119,10 @@ def key_times(pairs: list[str], runs: int) -> None:
         for number, pair in enumerate(pairs):
             folder = Path(name) / str(number)
             cover, secret = pair.split(":")
-            method = CarryOptions(fine_tune="never")
             keyss.hide(
                 cover,
                 [keyss.Secret(secret, KEY)],
-                method=method,
+                method=CarryOptions(fine_tune="never"),
                 views=keyss.ViewOptions(32),
                 min_psnr=0,
                 out=folder / "run",

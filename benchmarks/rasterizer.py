@@ -14,49 +14,41 @@ import platform
 import resource
 import statistics
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise, product
 from pathlib import Path
-from typing import Any
 
 from keyss.core import Camera, Gaussians
 from keyss.files import read_model
 from keyss.rendering import rasterization, render
 
+import psutil
 import torch
 from torch import Tensor
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Case:
-    """The scene to render: synthetic Gaussians, or those of a file."""
+    """The scene to render: a file, or this many synthetic Gaussians."""
 
     name: str
     width: int
     height: int
-    count: int = 0
-    file: Path | None = None
+    source: int | Path
 
     def scene(self) -> tuple[Gaussians, Camera]:
-        gaussians = synthetic_model(self.count) if self.file is None else read_model(self.file)
-        return gaussians, camera_before(gaussians.means, self.width, self.height)
+        model = read_model(self.source) if isinstance(self.source, Path) else synthetic_model(self.source)
+        return model, camera_before(model.means, self.width, self.height)
 
 
-CASES = (
-    Case(name="50k synthetic", width=400, height=266, count=50_000),
-    Case(name="200k synthetic", width=780, height=520, count=200_000),
-)
-LARGE = Case(name="1M synthetic", width=1600, height=1066, count=1_000_000)
+CASES = (Case("50k synthetic", 400, 266, 50_000), Case("200k synthetic", 780, 520, 200_000))
+LARGE = Case("1M synthetic", 1600, 1066, 1_000_000)
 
 
 def synthetic_model(count: int) -> Gaussians:
     """A cloud of Gaussians of SH degree 3 whose sizes shrink with their number, like in fitted scenes."""
-    generator = torch.Generator().manual_seed(0)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator)
-
+    normal = partial(torch.randn, generator=torch.Generator().manual_seed(0))
     return Gaussians(
         means=normal(count, 3) * torch.tensor([1.2, 0.8, 1.0]),
         quats=normal(count, 4),
@@ -83,67 +75,33 @@ def load_kernels() -> None:
     render(gaussians, camera_before(gaussians.means.detach(), 8, 8)).sum().backward()
 
 
-class Clock:
-    """Milliseconds of each part of what is repeated; the first time is a warm-up."""
-
-    def __init__(self) -> None:
-        self.times: dict[str, list[float]] = {}
-
-    def __call__(self, part: str, work: Callable[[], Any]) -> Any:
-        start = time.perf_counter()
-        result = work()
-        self.times.setdefault(part, []).append(1e3 * (time.perf_counter() - start))
-        return result
-
-    def text(self, part: str) -> str:
-        times = self.times[part][1:]
-        return f"{min(times):.1f} ({statistics.median(times):.1f})"
-
-
-def leaves_of(model: Gaussians) -> list[Tensor]:
-    tensors = (model.means, model.quats, model.scales, model.opacities, model.sh)
-    return [tensor.detach().requires_grad_() for tensor in tensors]
-
-
-def draw(leaves: list[Tensor], camera: Camera, sh_degree: int) -> Tensor:
-    size = (camera.width, camera.height)
-    return rasterization(*leaves, camera.viewmat, camera.K, *size, sh_degree=sh_degree)[0]
-
-
 def measure_rasterizer(case: Case, threads: int, repeats: int) -> list[str]:
     """One row of the table."""
     torch.set_num_threads(threads)
     load_kernels()  # not counted as peak memory
-    gaussians, camera = case.scene()
-    leaves, clock = leaves_of(gaussians), Clock()
+    model, camera = case.scene()
+    tensors = (model.means, model.quats, model.scales, model.opacities, model.sh)
+    leaves = [tensor.detach().requires_grad_() for tensor in tensors]
+    view = camera.viewmat, camera.K, camera.width, camera.height
     weights = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
-    work = partial(draw, leaves, camera, gaussians.sh_degree)
-    before = _memory()
-    for _ in range(repeats + 1):
+    times: list[tuple[float, ...]] = []
+    before = psutil.Process().memory_info().rss
+    for _ in range(repeats + 1):  # the first is a warm-up
+        clock = [time.perf_counter()]
         with torch.no_grad():
-            clock("only", work)
-        image = clock("forward", work)
-        clock("backward", partial(image.backward, weights))
+            rasterization(*leaves, *view, sh_degree=model.sh_degree)
+        clock.append(time.perf_counter())
+        image = rasterization(*leaves, *view, sh_degree=model.sh_degree)[0]
+        clock.append(time.perf_counter())
+        image.backward(weights)
+        clock.append(time.perf_counter())
+        times.append(tuple(1e3 * (after - start) for start, after in pairwise(clock)))
         del image
         for leaf in leaves:
             leaf.grad = None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
-    times = map(clock.text, ("only", "forward", "backward"))
-    return [f"{case.name}, {case.width}x{case.height}", str(threads), *times, f"{peak / 2**20:.0f}"]
-
-
-def _memory() -> int:
-    """Bytes of memory in use by this process; the peak so far on systems that do not report it."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-    except OSError:
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    return pages * os.sysconf("SC_PAGESIZE")
-
-
-def table(titles: list[str], rows: list[list[str]]) -> str:
-    """A Markdown table."""
-    return "\n".join(f"| {' | '.join(row)} |" for row in (titles, ["---"] * len(titles), *rows))
+    parts = [f"{min(part):.1f} ({statistics.median(part):.1f})" for part in zip(*times[1:], strict=True)]
+    return [f"{case.name}, {case.width}x{case.height}", str(threads), *parts, f"{peak / 2**20:.0f}"]
 
 
 def main() -> None:
@@ -159,24 +117,21 @@ def main() -> None:
         files = sorted(options.models.rglob("*.ply"))
         if not files:
             parser.error(f"--models: no .ply file in {options.models}")
-        cases += [Case(name=file.stem, width=780, height=520, file=file) for file in files]
+        cases += [Case(file.stem, 780, 520, file) for file in files]
     load_kernels()  # compiles them, for the processes below to load
 
     context = multiprocessing.get_context("spawn")
-
-    n = options.repeats
-    pairs = [(case, threads) for case in cases for threads in options.threads]
-    titles = ["scene, SH 3", "threads", "forward only", "forward", "backward", "peak MiB"]
-    rows = []
-    for case, threads in pairs:
-        with context.Pool(1) as pool:
-            rows.append(pool.apply(measure_rasterizer, (case, threads, n)))
-    heading = (
+    print(
         f"{platform.machine()}, {os.cpu_count()} cores; Python {platform.python_version()}, torch "
-        f"{torch.__version__}. Milliseconds of wall time: the smallest of {n} repeats, and in brackets the "
-        "median."
+        f"{torch.__version__}. Milliseconds of wall time: the smallest of {options.repeats} repeats, and in "
+        "brackets the median.\n"
     )
-    print(f"{heading}\n\n{table(titles, rows)}")
+    print("| scene, SH 3 | threads | forward only | forward | backward | peak MiB |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for case, threads in product(cases, options.threads):
+        with context.Pool(1) as pool:
+            row = pool.apply(measure_rasterizer, (case, threads, options.repeats))
+        print(f"| {' | '.join(row)} |", flush=True)
 
 
 if __name__ == "__main__":

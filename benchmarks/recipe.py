@@ -22,7 +22,6 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-import keyss  # noqa: F401  before torch, see `ruff.toml`
 from keyss import FitConfig, Gaussians, read_model
 from keyss.core import SH_C0, Camera, Scene, View
 from keyss.files import load_scene

@@ -23,7 +23,6 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
-import keyss  # noqa: F401  before torch, see `ruff.toml`
 from keyss.files import read_model
 
 import numpy as np
@@ -60,21 +59,11 @@ class File:
     secret: str = ""
 
 
-@dataclass(frozen=True)
-class Job:
-    """A plain model, from which to make files."""
-
-    index: int
-    scene: str
-    path: str
-    secret: str
-
-
 def main() -> None:
     options = _arguments()
     started = time.monotonic()
     with ProcessPoolExecutor(options.workers, get_context("fork"), torch.set_num_threads, (1,)) as pool:
-        files = [file for made in pool.map(_make, _jobs(options)) for file in made]
+        files = [file for made in pool.map(_make, *_jobs(options)) for file in made]
         for scene, path, given in map(_parse_named, options.pairs):
             files.append(File("plain", scene, path, read_model(path)))
             files.append(File("given", scene, path, read_model(given)))
@@ -109,32 +98,32 @@ def _parse_named(text: str) -> tuple[str, str, str]:
     return scene, first, second
 
 
-def _jobs(options: argparse.Namespace) -> list[Job]:
+def _jobs(options: argparse.Namespace) -> tuple[range, list[str], list[str], list[str]]:
+    """Numbers, scenes, plain models, and models of another scene, each time different if there are enough."""
     plain = [_parse_named(text)[:2] for text in options.plain]
-    jobs = []
-    for index, (scene, path) in enumerate(plain):
-        others = [each for named, each in plain if named != scene]
-        # The secret is of another scene, and a different model each time if there are enough.
-        jobs.append(Job(index, scene, path, others[(7 * index + 3) % len(others)]))
-    return jobs
+    secrets = []
+    for index, (scene, _) in enumerate(plain):
+        others = [path for named, path in plain if named != scene]
+        secrets.append(others[(7 * index + 3) % len(others)])
+    return range(len(plain)), [scene for scene, _ in plain], [path for _, path in plain], secrets
 
 
-def _make(job: Job) -> list[File]:
+def _make(index: int, scene: str, path: str, hidden: str) -> list[File]:
     """The plain model, and files that hide something; nothing for a cover that hiding refuses."""
-    cover = read_model(job.path)
-    made = [File("plain", job.scene, job.path, cover)]
+    cover = read_model(path)
+    made = [File("plain", scene, path, cover)]
     try:
         capacity = CarryCapacity.of(LOW_BITS, cover, FitConfig())
     except UsageError as error:
-        print(f"{job.path} is left out: {error}", file=sys.stderr)
+        print(f"{path} is left out: {error}", file=sys.stderr)
         return []
-    whole = read_model(job.secret)
+    whole = read_model(hidden)
     (secret,) = capacity.prune([whole], [Viewpoints.around(whole)])
-    stego = carried.embed_derived(cover, [(keys(2 * job.index), secret)], os.urandom(32))
-    made.append(File("carried", job.scene, job.path, stego, job.secret))
+    stego = carried.embed_derived(cover, [(keys(2 * index), secret)], os.urandom(32))
+    made.append(File("carried", scene, path, stego, hidden))
     with suppress(UsageError):  # a small model has no room for a payload
-        payload = embed_derived(cover, [(keys(2 * job.index + 1), os.urandom(PAYLOAD_BYTES))], os.urandom(32))
-        made.append(File("payload", job.scene, job.path, payload))
+        payload = embed_derived(cover, [(keys(2 * index + 1), os.urandom(PAYLOAD_BYTES))], os.urandom(32))
+        made.append(File("payload", scene, path, payload))
     return made
 
 

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-import keyss  # noqa: F401  before torch, see `ruff.toml`
 from keyss import FitConfig
 from keyss.core import Scene
 from keyss.files import load_scene

@@ -51,7 +51,10 @@ def umask() -> Iterator[None]:
 
 @pytest.fixture(name="keyss")
 def _keyss(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Run the command line in this process, without KEYSS_KEY and without a terminal."""
+    """Run the command line in this process, without KEYSS_KEY and without a terminal.
+
+    The first argument is split at spaces: `keyss("info a.ply --json")`.
+    """
     from cli.harness import Result
     from keyss.cli import main
 
@@ -61,10 +64,10 @@ def _keyss(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("sys.stdin", io.StringIO())
     monkeypatch.setattr("keyss.progress._LOG_SECONDS", 1e6)  # slow machines print no further lines
 
-    def run(*arguments: object) -> Result:
+    def run(command: object, *arguments: object) -> Result:
         capsys.readouterr()
         try:
-            status = main([str(argument) for argument in arguments])
+            status = main([*str(command).split(), *map(str, arguments)])
         except SystemExit as end:
             status = int(end.code or 0)
         return Result(status, *capsys.readouterr())

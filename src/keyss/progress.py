@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn
@@ -16,7 +15,6 @@ from rich.text import Text
 level = 0  # -1: silent, 1: more often; set by the command line
 _DELAY_SECONDS = 1.0  # before a terminal displays a wait
 _LOG_SECONDS = 5.0  # after which a silent log gets a line
-_PRIOR = 0.1  # weight of an estimated time in the pace of a wait, relative to all of its work
 
 Share = Callable[[float], None]  # called with the share of the work that is done
 
@@ -127,7 +125,7 @@ class ProgressLines(Reporter):
     @contextmanager
     def waiting(self, what: str, seconds: float) -> Iterator[Share]:
         """See `Reporter`. A terminal displays a moving sign after 1 s."""
-        wait = Wait(what, seconds * _crowding(), self.timer)
+        wait = Wait(what, seconds, self.timer)
 
         def display(ended: threading.Event) -> None:
             if not ended.wait(_DELAY_SECONDS):
@@ -174,13 +172,9 @@ class Wait:
 
     @property
     def left(self) -> float:
-        """Estimate of the seconds left; below 0 if the work takes longer than estimated.
-
-        The estimated time is scaled by the pace of the work that is done.
-        """
-        prior = _PRIOR * self.seconds
-        pace = (self.at - self.start + prior) / (self.share * self.seconds + prior)
-        return (1 - self.share) * self.seconds * pace - (self.timer() - self.at)
+        """Seconds left at the pace of the work so far, else as estimated; below 0 if it takes longer."""
+        total = (self.at - self.start) / self.share if self.share else self.seconds
+        return self.start + total - self.timer()
 
     def __str__(self) -> str:
         left = self.left
@@ -189,13 +183,6 @@ class Wait:
 
     def __rich__(self) -> Text:
         return Text(str(self))
-
-
-def _crowding() -> float:
-    """Factor on the time of work beside others: processes per core, at least 1."""
-    with suppress(AttributeError, OSError):  # not on Windows
-        return max(1.0, (os.getloadavg()[0] + 1) / (os.cpu_count() or 1))
-    return 1.0
 
 
 def say(*lines: object) -> None:

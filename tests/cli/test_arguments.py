@@ -51,21 +51,9 @@ def test_secrets_are_paired_with_keys(keyss: Run, hide_calls: list[Any], tmp_pat
 
 def test_options_override_preset(keyss: Run, hide_calls: list[Any]) -> None:
     result = keyss(
-        *("hide", "--cover", "A", "--secret", "B", "-o", "out", "--preset", "quick", "--iterations", 7),
-        *(
-            "--max-gaussians",
-            80,
-            "--seed",
-            9,
-            "--method",
-            "keyss",
-            "--design",
-            "released",
-            "--mask",
-            "xyz,sc",
-        ),
-        *("--width", 20),
-        *("--background", 1, 0.5, 0, "--cover-model", "m.ply", "--resume", "--device", "cpu"),
+        "hide --cover A --secret B -o out --preset quick --iterations 7 --max-gaussians 80 --seed 9 "
+        "--method keyss --design released --mask xyz,sc --width 20 --background 1 0.5 0 --cover-model m.ply "
+        "--resume --device cpu"
     )
     assert result.status == 0, result.err
     _, options = hide_calls[0]
@@ -113,25 +101,3 @@ def test_method_options(keyss: Run, hide_calls: list[Any]) -> None:
 def test_invalid_values(keyss: Run, hide_calls: list[Any], extra: tuple[object, ...], words: str) -> None:
     assert_refused(keyss("hide", "--cover", "A", "--secret", "B", "-o", "out", *extra), 2, words)
     assert hide_calls == []
-
-
-@pytest.mark.parametrize(
-    ("extra", "words"),
-    [
-        (("--iterations", 7), "--iterations: nothing is trained"),
-        (
-            ("--preset", "quick", "--max-gaussians", 80),
-            "--preset and --max-gaussians: nothing is trained",
-        ),
-    ],
-)
-def test_options_without_effect(
-    keyss: Run, hide_calls: list[Any], extra: tuple[object, ...], words: str
-) -> None:
-    carry = ("hide", "--fine-tune", "never", "-o", "out", *extra)
-    assert_refused(keyss(*carry, "--cover", "a.ply", "--secret", "b.ply"), 2, words)
-    models = ("--cover-model", "a.ply", "--secret-model", "b.ply")
-    assert_refused(keyss(*carry, "--cover", "A", "--secret", "B", *models), 2, words)
-    assert hide_calls == []
-    assert keyss(*carry, "--cover", "a.ply", "--secret", "B").status == 0
-    assert keyss("hide", "-o", "out", *extra, "--cover", "a.ply", "--secret", "b.ply").status == 0

@@ -13,123 +13,74 @@ import pytest
 from cli.harness import SMALL, Run, assert_refused, listing
 from files.scene_files import write_colmap
 
-STEGO = "hidden/publish/model.ply"
 
-
-def _fit_truncated(folder: Path) -> list[object]:
+def _truncate_points(folder: Path) -> None:
     points = write_colmap(folder / "scene", count=4) / "sparse" / "0" / "points3D.bin"
     points.write_bytes(points.read_bytes()[:40])
-    return ["fit", folder / "scene", "-o", folder / "out", *SMALL]
 
 
-def _reveal_changed(change: Callable[[bytes], bytes]) -> Callable[[Path], list[object]]:
-    """`reveal` on a stego file with changed bytes."""
-
-    def prepare(folder: Path) -> list[object]:
-        stego = folder / "hidden" / "publish" / "model.ply"
-        stego.write_bytes(change(stego.read_bytes()))
-        return ["reveal", stego, "--key-file", folder / "key.txt", "-o", folder / "secret.ply"]
-
-    return prepare
+def _truncate_stego(folder: Path) -> None:
+    stego = folder / "hidden" / "publish" / "model.ply"
+    stego.write_bytes(stego.read_bytes()[:-1])
 
 
-def _hide(folder: Path, **changes: object) -> list[object]:
-    options = {"--cover": folder / "a", "--secret": folder / "b", "--key-file": folder / "key.txt"}
-    options |= {"--out": folder / "out"} | {
-        f"--{name.replace('_', '-')}": value for name, value in changes.items()
-    }
-    return [
-        "hide",
-        "--publish",
-        "converted",
-        *(part for option in options.items() for part in option),
-        *SMALL,
-    ]
-
-
-def _hide_models(folder: Path, *extra: object, **changes: object) -> list[object]:
-    files = {"cover": _private_model(folder, "cover"), "secret": _private_model(folder, "secret-1")}
-    files |= {"out": folder / "out", "key_file": folder / "key.txt"} | changes
-    options = [part for name, value in files.items() for part in (f"--{name.replace('_', '-')}", value)]
-    return ["hide", "--publish", "converted", *options, *extra]
-
-
-def _link_loop(folder: Path) -> Path:
+def _link_loop(folder: Path) -> None:
     (folder / "loop.ply").symlink_to("loop.ply")
-    return folder
 
 
-def _hide_without_clip(folder: Path) -> list[object]:
+def _need_clip(folder: Path) -> None:
     pytest.importorskip("transformers", reason="needs keyss[clip]")
-    return _hide_by_keyss(folder, design="published", key_encoder="clip", clip_model=folder / "a")
 
 
-def _hide_by_keyss(folder: Path, **changes: object) -> list[object]:
-    command, _, _, *options = _hide(folder, method="keyss", **changes)
-    return [command, *options]
-
-
-def _private_model(folder: Path, name: str) -> Path:
-    return folder / "hidden" / "private" / f"{name}.ply"
-
-
-def _reveal_to(folder: Path, out: str) -> list[object]:
-    return ["reveal", folder / STEGO, "--key-file", folder / "key.txt", "-o", folder / out]
-
-
-ERRORS: dict[str, tuple[int, str, Callable[[Path], list[object]]]] = {
-    "unknown layout": (4, "Known layouts", lambda f: ["fit", f / "hidden/private", "-o", f / "out"]),
-    "fit of a model": (4, "found a 3DGS model", lambda f: ["fit", f / STEGO, "-o", f / "out"]),
-    "truncated points": (4, "points3D", _fit_truncated),
-    "no cover": (4, "nowhere", lambda f: _hide(f, cover=f / "nowhere")),
-    "too few Gaussians": (2, "--channel appended has room", lambda f: [*_hide(f), "--channel", "colours"]),
-    "output exists": (5, "--overwrite", lambda f: _hide(f, out=f / "hidden")),
-    "output exists, and no key": (5, "key.txt exists", lambda f: ["reveal", f / STEGO, "-o", f / "key.txt"]),
-    "output is a file": (5, "not a folder", lambda f: ["fit", f / "a", "-o", f / "key.txt"]),
-    "key file missing": (4, "none.txt", lambda f: _hide(f, key_file=f / "none.txt")),
-    "too few key files": (2, "--key-file", lambda f: [*_hide(f), "--secret", f / "b"]),
-    "no key at all": (2, "KEYSS_KEY", lambda f: ["reveal", f / STEGO, "-o", f / "s.ply"]),
-    "data truncated": (4, "model.ply", _reveal_changed(lambda data: data[:-1])),
-    "a secret among what is published": (
-        5,
-        "given away",
-        lambda f: _reveal_to(f, "hidden/publish/secret.ply"),
-    ),
-    "a run in what is published": (5, "given away", lambda f: _hide(f, out=f / "hidden/publish/out")),
-    "a model of a model": (
-        2,
-        "leave out --cover-model",
-        lambda f: _hide(f, cover=_private_model(f, "cover"), cover_model=_private_model(f, "secret-1")),
-    ),
-    "tiny pictures": (
-        2,
-        "--width: expected at least 16 pixels, got 5",
-        lambda f: _hide_models(f, "--width", 5),
-    ),
-    "enormous pictures of a model": (2, "width", lambda f: _hide_models(f, "--width", 10**10)),
-    "a link to itself": (4, "loop.ply", lambda f: _hide_models(f, secret=_link_loop(f) / "loop.ply")),
-    "a model of a secret model": (
-        2,
-        "leave out --secret-model",
-        lambda f: _hide(f, secret=_private_model(f, "secret-1"), secret_model=_private_model(f, "cover")),
-    ),
-    "info of nothing": (4, "nowhere", lambda f: ["info", f / "nowhere"]),
-    "clip without a model": (6, "--clip-model", _hide_without_clip),
-    "background out of range": (
-        2,
-        "background",
-        lambda f: ["fit", f / "a", "-o", f / "out", "--background", 0, 0, 9],
-    ),
+SIZE, STEGO = " ".join(SMALL), "hidden/publish/model.ply"
+HIDE = f"hide --publish converted --cover a --secret b --key-file key.txt -o out {SIZE}"
+MODELS = "hide --publish converted --cover hidden/private/cover.ply --key-file key.txt -o out"
+TWO_MODELS = f"{MODELS} --secret hidden/private/secret-1.ply"
+REVEAL = f"reveal {STEGO} --key-file key.txt -o"
+CLIP = HIDE.replace("--publish converted", "--method keyss --design published --key-encoder clip")
+# Exit status, words of the message and the command, by what is wrong.
+ERRORS: dict[str, tuple[int, str, str]] = {
+    "unknown layout": (4, "Known layouts", "fit hidden/private -o out"),
+    "fit of a model": (4, "found a 3DGS model", f"fit {STEGO} -o out"),
+    "truncated points": (4, "points3D", f"fit scene -o out {SIZE}"),
+    "no cover": (4, "nowhere", HIDE.replace("--cover a", "--cover nowhere")),
+    "too few Gaussians": (2, "--channel appended has room", f"{HIDE} --channel colours"),
+    "output exists": (5, "--overwrite", HIDE.replace("-o out", "-o hidden")),
+    "output exists, and no key": (5, "key.txt exists", f"reveal {STEGO} -o key.txt"),
+    "output is a file": (5, "not a folder", "fit a -o key.txt"),
+    "key file missing": (4, "none.txt", HIDE.replace("key.txt", "none.txt")),
+    "too few key files": (2, "--key-file", f"{HIDE} --secret b"),
+    "no key at all": (2, "KEYSS_KEY", f"reveal {STEGO} -o s.ply"),
+    "data truncated": (4, "model.ply", f"{REVEAL} secret.ply"),
+    "a secret among what is published": (5, "given away", f"{REVEAL} hidden/publish/secret.ply"),
+    "a run in what is published": (5, "given away", HIDE.replace("-o out", "-o hidden/publish/out")),
+    "a model of a model": (2, "leave out --cover-model", f"{TWO_MODELS} --cover-model {STEGO}"),
+    "a model of a secret model": (2, "leave out --secret-model", f"{TWO_MODELS} --secret-model {STEGO}"),
+    "tiny pictures": (2, "--width: expected at least 16 pixels, got 5", f"{TWO_MODELS} --width 5"),
+    "enormous pictures of a model": (2, "width", f"{TWO_MODELS} --width {10**10}"),
+    "a link to itself": (4, "loop.ply", f"{MODELS} --secret loop.ply"),
+    "info of nothing": (4, "nowhere", "info nowhere"),
+    "clip without a model": (6, "--clip-model", f"{CLIP} --clip-model a"),
+    "background out of range": (2, "background", "fit a -o out --background 0 0 9"),
+}
+PREPARE: dict[str, Callable[[Path], None]] = {
+    "truncated points": _truncate_points,
+    "data truncated": _truncate_stego,
+    "a link to itself": _link_loop,
+    "clip without a model": _need_clip,
 }
 
 
 @pytest.mark.parametrize("name", ERRORS)
-def test_errors(keyss: Run, workspace: Path, tmp_path: Path, name: str) -> None:
-    status, words, prepare = ERRORS[name]
+def test_errors(
+    keyss: Run, workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    status, words, command = ERRORS[name]
     shutil.copytree(workspace, tmp_path, dirs_exist_ok=True)
-    arguments = prepare(tmp_path)
+    PREPARE.get(name, lambda folder: None)(tmp_path)
+    monkeypatch.chdir(tmp_path)
     before = listing(tmp_path)
-    assert_refused(keyss(*arguments), status, words)
+    assert_refused(keyss(*command.split()), status, words)
     assert listing(tmp_path) == before
 
 

@@ -37,16 +37,6 @@ def test_key_sources_are_equivalent(keyss: Run, monkeypatch: pytest.MonkeyPatch)
         assert ("white space around the key does not count" in result.err) == key.endswith(" ")
 
 
-def test_cover_without_harmonics(keyss: Run) -> None:
-    flat = [word.replace("cover.ply", "flat.ply") for word in HIDE]
-    shown = keyss(*flat, "--secret", "large.ply", "-o", "shown")
-    assert shown.status == 0, shown.err
-    assert "falling back to --publish converted, which inspection finds" in shown.err.splitlines()[0]
-    refused = keyss(*flat, "--secret", "large.ply", "--format", "ply", "-o", "run")
-    assert refused.status == 7  # few low bits, for a few Gaussians of the secret
-    assert "--publish converted keeps all of them" in refused.err
-
-
 def test_hide_from_few_photos(keyss: Run, workspace: Path) -> None:
     few = [word if word != "100" else "1200" for word in SMALL]
     result = keyss("hide", *scene_arguments(workspace), *few, "--fine-tune", "always", "-o", "run")

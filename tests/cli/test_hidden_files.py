@@ -20,10 +20,12 @@ from keyss.core import InputError, KeyssWarning, UsageError
 from keyss.methods import HiddenFile
 
 KEYS = ("q7Rv2LxT9bWm4KzD", "W2mz8Qe5TnYc6LkA")
+HIDE = "hide --cover cover.ply --secret-file letter.pdf --secret-file empty --key-file key0 --key-file key1"
+STEGO = "out/publish/model.ply"
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A cover, two files, two keys, and `out`, which hides both."""
     made = tmp_path_factory.mktemp("files")
     write_model(made / "cover.ply", trained_like(3000))
@@ -31,25 +33,25 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (made / "empty").write_bytes(b"")
     for index, key in enumerate(KEYS):
         write_key(made / f"key{index}", key)
-    assert main([str(argument) for argument in _arguments(made, made / "out")]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(made)
+        assert main([*HIDE.split(), "-o", "out"]) == 0
     return made
 
 
-def _arguments(folder: Path, out: Path) -> list[object]:
-    keys = ["--key-file", folder / "key0", "--key-file", folder / "key1"]
-    files = ["--secret-file", folder / "letter.pdf", "--secret-file", folder / "empty"]
-    return ["hide", "--cover", folder / "cover.ply", *files, *keys, "-o", out]
+@pytest.fixture(autouse=True)
+def folder(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(files)
 
 
-def test_round_trip(keyss: Run, folder: Path, tmp_path: Path) -> None:
-    stego = folder / "out" / "publish" / "model.ply"
-    assert stego.stat().st_size == (folder / "cover.ply").stat().st_size
+def test_round_trip(keyss: Run, tmp_path: Path) -> None:
+    assert os.path.getsize(STEGO) == os.path.getsize("cover.ply")
     for index, name in enumerate(("letter.pdf", "empty")):
         out = tmp_path / f"back{index}"
-        result = keyss("reveal", stego, "--key-file", folder / f"key{index}", "-o", out)
+        result = keyss(f"reveal {STEGO} --key-file key{index} -o {out}")
         assert result.status == 0
         assert repr(name) in result.out
-        assert out.read_bytes() == (folder / name).read_bytes()
+        assert out.read_bytes() == Path(name).read_bytes()
         assert stat.S_IMODE(out.stat().st_mode) == 0o600
 
 
@@ -62,58 +64,54 @@ def test_hidden_model_file_is_revealed_as_it_was(tmp_path: Path) -> None:
         library.reveal(hidden.stego, KEYS[0], out=tmp_path / "back.spz")
 
 
-def test_verify(keyss: Run, folder: Path) -> None:
-    stego = folder / "out" / "publish" / "model.ply"
+def test_verify(keyss: Run) -> None:
     for command in ("evaluate", "audit"):
-        assert_refused(keyss(command, folder / "out"), 4, f"nothing to evaluate; `keyss verify {stego} ")
+        assert_refused(keyss(f"{command} out"), 4, f"nothing to evaluate; `keyss verify {STEGO} ")
     for index, count in enumerate(("3,000 of 3,000", "0")):
-        result = keyss("verify", stego, "--key-file", folder / f"key{index}")
+        result = keyss(f"verify {STEGO} --key-file key{index}")
         assert (result.status, result.err) == (0, "")
         assert f"secret  {count} bytes: complete" in result.out
 
 
-def test_file_from_a_pruned_model(keyss: Run, folder: Path, tmp_path: Path) -> None:
+def test_file_from_a_pruned_model(keyss: Run, tmp_path: Path) -> None:
     """The file is complete, and the loss does not go unnoticed."""
-    stego = read_model(folder / "out" / "publish" / "model.ply")
+    stego, out = read_model(STEGO), tmp_path / "file.bin"
     write_model(tmp_path / "pruned.ply", stego[: len(stego) * 4 // 5])
-    arguments = (tmp_path / "pruned.ply", "--key-file", folder / "key0")
-    verified = keyss("verify", *arguments)
-    assert verified.status == 4
-    assert "shards of the secret's payload were lost, and restored" in verified.err
-    revealed = keyss("reveal", *arguments, "-o", tmp_path / "file.bin")
-    assert revealed.status == 0
-    assert "shards of the secret's payload were lost, and restored" in revealed.err
-    assert (tmp_path / "file.bin").stat().st_size == 3000
+    for status, command in ((4, "verify"), (0, f"reveal -o {out}")):
+        result = keyss(f"{command} {tmp_path}/pruned.ply --key-file key0")
+        assert result.status == status
+        assert "shards of the secret's payload were lost, and restored" in result.err
+    assert out.stat().st_size == 3000
 
 
-def test_invalid_combinations(keyss: Run, folder: Path, workspace: Path, tmp_path: Path) -> None:
-    out, back = tmp_path / "out", tmp_path / "back"
-    hide = _arguments(folder, out)
-    assert_refused(keyss(*hide, "--secret", folder / "cover.ply"), 2, "scenes or files, not both")
-    planned = keyss(*hide, "--dry-run")
+def test_invalid_combinations(keyss: Run, workspace: Path, tmp_path: Path) -> None:
+    hide, reveal = f"{HIDE} -o {tmp_path}/out", f"reveal {STEGO} --key-file key0 -o {tmp_path}"
+    letter = f"hide --cover cover.ply --secret letter.pdf --key-file key0 -o {tmp_path}/out"
+    photos = f"hide --cover {workspace}/a --secret-file empty --key-file key0 -o {tmp_path}/out"
+    for status, words, command in (
+        (2, "scenes or files, not both", f"{hide} --secret cover.ply"),
+        (2, "--min-psnr is for hidden scenes", f"{hide} --min-psnr 60"),
+        (2, "--seed is for hidden scenes", f"{hide} --seed 0"),
+        (4, "--secret-file hides any file", letter),
+        (2, "needs a model as the cover", photos),
+        (2, "3,000 bytes, 'letter.pdf'", f"{reveal}/s.ply"),
+        (2, "--frame is for scenes", f"{reveal}/back --frame cover"),
+        (3, "opens nothing", f"{reveal}/back".replace(STEGO, "cover.ply")),
+        (5, "given away", f"reveal {STEGO} --key-file key0 -o out/publish/back"),
+    ):
+        assert_refused(keyss(command), status, words)
+    planned = keyss(f"{hide} --dry-run")
     assert (planned.status, planned.out.splitlines()[-1]) == (0, "Dry run: nothing was written.")
-    letter = (*_arguments(folder, out)[:3], "--secret", folder / "letter.pdf", *hide[-6:])
-    assert_refused(keyss(*letter), 4, "--secret-file hides any file")
-    for flag, value in (("--min-psnr", 60), ("--seed", 0), ("--width", 100)):
-        assert_refused(keyss(*hide, flag, value), 2, f"leave out {flag}")
-    photos = ("hide", "--cover", workspace / "a", "--secret-file", folder / "empty", "-o", out)
-    assert_refused(keyss(*photos, "--key-file", folder / "key0"), 2, "needs a model as the cover")
-    stego, key = folder / "out" / "publish" / "model.ply", ("--key-file", folder / "key0")
-    assert_refused(keyss("reveal", stego, *key, "-o", tmp_path / "s.ply"), 2, "3,000 bytes, 'letter.pdf'")
-    assert_refused(keyss("reveal", stego, *key, "-o", back, "--frame", "cover"), 2, "--frame is for scenes")
-    assert_refused(keyss("reveal", folder / "cover.ply", *key, "-o", back), 3, "opens nothing")
-    assert_refused(keyss("reveal", stego, *key, "-o", stego.parent / "back"), 5, "given away")
     assert listing(tmp_path) == {}
 
 
-def test_names_that_are_not_text(folder: Path, tmp_path: Path) -> None:
+def test_names_that_are_not_text(tmp_path: Path) -> None:
     named = tmp_path / os.fsdecode(b"K\xfcche.pdf")
     named.write_bytes(b"plan")
-    hidden = library.hide(folder / "cover.ply", [library.SecretFile(named, KEYS[0])])
+    hidden = library.hide("cover.ply", [library.SecretFile(named, KEYS[0])])
     assert hidden.stego is not None
-    assert library.reveal(hidden.stego, KEYS[0]).file == HiddenFile(
-        "K\N{REPLACEMENT CHARACTER}che.pdf", b"plan"
-    )
+    expected = HiddenFile("K\N{REPLACEMENT CHARACTER}che.pdf", b"plan")
+    assert library.reveal(hidden.stego, KEYS[0]).file == expected
 
 
 def test_file_too_large() -> None:
@@ -127,20 +125,19 @@ def test_file_too_large() -> None:
     assert library.reveal(hidden.stego, KEYS[0]).file.data == large.file
 
 
-def test_hidden_file_survives_conversion(keyss: Run, folder: Path, tmp_path: Path) -> None:
+def test_hidden_file_survives_conversion(keyss: Run, tmp_path: Path) -> None:
+    key, note = Path("key0").absolute(), tmp_path / "note.txt"
     write_model(tmp_path / "cover.ply", cover(6000))
-    (tmp_path / "note.txt").write_text("Meet me at the golden knot. " * 20)
-    key, out = ("--key-file", folder / "key0"), tmp_path / "out"
-    hide = ("hide", "--cover", tmp_path / "cover.ply", "--secret-file", tmp_path / "note.txt", *key)
-    result = keyss(*hide, "--publish", "converted", "-o", out)
-    assert (result.status, result.err) == (0, "")
-    assert "may be converted" in result.out
-    result = keyss("convert", out / "publish" / "model.ply", "-o", tmp_path / "web.spz", *key)
-    assert (result.status, result.err) == (0, "")
-    assert keyss("reveal", tmp_path / "web.spz", *key, "-o", tmp_path / "back").status == 0
-    assert (tmp_path / "back").read_bytes() == (tmp_path / "note.txt").read_bytes()
-    result = keyss("reveal", tmp_path / "web.spz", "--key-file", folder / "key1", "-o", tmp_path / "none")
-    assert_refused(result, 3, "opens nothing")
+    note.write_text("Meet me at the golden knot. " * 20)
+    os.chdir(tmp_path)
+    hidden = keyss("hide --cover cover.ply --secret-file note.txt --publish converted -o out --key-file", key)
+    assert (hidden.status, hidden.err) == (0, "")
+    assert "may be converted" in hidden.out
+    converted = keyss(f"convert {STEGO} -o web.spz --key-file {key}")
+    assert (converted.status, converted.err) == (0, "")
+    assert keyss(f"reveal web.spz --key-file {key} -o back").status == 0
+    assert (tmp_path / "back").read_bytes() == note.read_bytes()
+    assert_refused(keyss(f"reveal web.spz --key-file {key.with_name('key1')} -o none"), 3, "opens nothing")
 
 
 @given(st.binary(max_size=300))

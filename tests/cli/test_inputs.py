@@ -41,14 +41,6 @@ def test_path_inside_run(keyss: Run, workspace: Path, command: str, inside: str)
     assert f"found {kind} in one; give {workspace / 'hidden'}" in result.err
 
 
-@pytest.mark.parametrize("command", ["evaluate", "audit"])
-def test_folder_of_a_fit(keyss: Run, tmp_path: Path, command: str) -> None:
-    (tmp_path / "private").mkdir()
-    for name in ("model.ply", "private/config.json"):
-        (tmp_path / name).write_text("{}")
-    assert_refused(keyss(command, tmp_path), 4, "found one that `keyss fit` wrote")
-
-
 def test_info_on_published_model_alone(keyss: Run, workspace: Path, tmp_path: Path) -> None:
     (tmp_path / "publish").mkdir()
     model = tmp_path / "publish" / "model.ply"
@@ -56,17 +48,6 @@ def test_info_on_published_model_alone(keyss: Run, workspace: Path, tmp_path: Pa
     for folder in (tmp_path, model.parent):
         result = keyss("info", folder, "--json")
         assert json.loads(result.out)["path"] == str(model)
-
-
-def test_key_file_as_model(keyss: Run, workspace: Path, tmp_path: Path) -> None:
-    (text,) = (workspace / "key.txt").read_text().split()
-    for arguments in (
-        ("info", workspace / "key.txt"),
-        ("reveal", workspace / "key.txt", *key_argument(workspace), "-o", tmp_path / "s.ply"),
-    ):
-        result = keyss(*arguments)
-        assert_refused(result, 4, "found a file of unknown kind")
-        assert text[:3] not in result.err
 
 
 @contextmanager

@@ -122,10 +122,11 @@ def test_readable_key_file_warning(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "tell nobody" not in err
 
 
-def test_weak_key_warning(capsys: pytest.CaptureFixture[str]) -> None:
-    keys.warn_of_weak_keys([generate_key(20)])
+def test_weak_key_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [write_key(tmp_path / "strong", generate_key(20)), write_key(tmp_path / "weak", "hunter2")]
+    keys.keys(files[:1], 1, new=True)
     assert capsys.readouterr().err == ""
-    keys.warn_of_weak_keys([generate_key(20), "hunter2"])
+    keys.keys(files, 2, new=True)
     err = capsys.readouterr().err
     assert "key 2: " in err
     assert "guesses" in err

@@ -12,8 +12,7 @@ from numpy.lib.recfunctions import append_fields, repack_fields
 from plyfile import PlyData, PlyElement
 
 from channels.lsb.trained_like import trained_like
-from cli.harness import SMALL, Run, write_key
-from files.scene_files import HEIGHT, WIDTH, save, write_colmap
+from cli.harness import Run, write_key
 from keyss.files import read_model, write_model
 
 Write = Callable[[Path, np.ndarray], None]
@@ -70,11 +69,6 @@ def write_gsply(path: Path, rows: np.ndarray) -> None:
 
 FACES = PlyElement.describe(np.array([([0, 1, 2],)], dtype=[("vertex_indices", "i4", (3,))]), "face")
 CAMERA = PlyElement.describe(np.zeros(1, [("view_px", "f4"), ("frame", "i4")]), "camera")
-TRAINING_OUTPUTS = (  # of Inria's program, gsplat and Nerfstudio
-    "point_cloud/iteration_30000/point_cloud.ply",
-    "ply/point_cloud_29999.ply",
-    "exports/splat/splat.ply",
-)
 KINDS: dict[str, Write] = {
     "big-endian doubles": write_doubles,
     "text": plyfile_writer(text=True),
@@ -113,36 +107,3 @@ def test_hide_reveal_view_convert(keyss: Run, tmp_path: Path, kind: str) -> None
     assert keyss("view", model, "-o", tmp_path / "page.html").status == 0
     result = keyss("convert", model, "-o", tmp_path / "model.spz")
     assert result.status == 0 or (kind == "one stray Gaussian" and "remove Gaussians far out" in result.err)
-
-
-@pytest.mark.parametrize(
-    "place",
-    TRAINING_OUTPUTS,
-)
-def test_training_folder_as_cover(keyss: Run, tmp_path: Path, place: str) -> None:
-    model, key = tmp_path / "training" / place, write_key(tmp_path / "key.txt")
-    model.parent.mkdir(parents=True)
-    write_model(model, trained_like(COUNT, 0, 1))
-    write_model(tmp_path / "secret.ply", trained_like(30, 1, 1))
-    secret = ("--secret", tmp_path / "secret.ply", "--key-file", key)
-    run = tmp_path / "run"
-    result = keyss(
-        "hide", "--cover", tmp_path / "training", *secret, "--width", 24, "--iterations", 5, "-o", run
-    )
-    assert result.status == 0, result.err
-    assert f"training: output of a training; its model is {place}" in result.err
-    stego = run / "publish" / "model.ply"
-    assert keyss("reveal", stego, "--key-file", key, "-o", tmp_path / "revealed.ply").status == 0
-
-
-def test_fit_with_masks(keyss: Run, tmp_path: Path) -> None:
-    scene = write_colmap(tmp_path / "scene")
-    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
-    mask[:, :3] = 255
-    for index in range(3):
-        save(scene / "masks" / f"{index:02}.png.png", mask)
-    result = keyss("fit", scene, "-o", tmp_path / "fit", *SMALL)
-    assert result.status == 0, result.err
-    assert (
-        "3 of 3 photos have masks, which leave 75% of their pixels out of training and measures" in result.err
-    )

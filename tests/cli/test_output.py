@@ -78,12 +78,6 @@ def test_help_and_errors_in_any_encoding(encoding: str) -> None:
     assert done.stderr.decode(encoding).startswith("keyss: error: nowhere/")
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_degrades_to_ascii(keyss: Run, command: str) -> None:
-    result = keyss(command, "--help").out
-    assert result.encode("ascii", process.REPLACING).count(b"?") == result.count("?")
-
-
 @pytest.mark.slow
 def test_c_locale(workspace: Path, tmp_path: Path) -> None:
     """`fit` and `info` in the C locale without Python's UTF-8 mode."""

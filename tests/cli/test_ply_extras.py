@@ -12,7 +12,6 @@ from cli.harness import Run, write_key
 from files.test_ply import columns_of, ply_bytes
 from keyss.core import Gaussians
 from keyss.files import read_model, write_model
-from keyss.files.formats.common import in_morton_order
 from keyss.files.ply_table import read_vertices
 
 COUNT = 1500
@@ -107,17 +106,3 @@ def test_hide_keeps_the_header_of_another_program(keyss: Run, tmp_path: Path, st
     assert published != data
     stego = tmp_path / "run" / "publish" / "model.ply"
     assert keyss("reveal", stego, "--key-file", key, "-o", tmp_path / "out").status == 0
-
-
-def test_hide_keeps_comments_where_gaussians_change_places(keyss: Run, tmp_path: Path) -> None:
-    """As in a .ply that was decoded from a .sog, which stays in the order of its positions."""
-    write_model(tmp_path / "coded.sog", in_morton_order(trained_like(COUNT)))
-    write_model(tmp_path / "cover.ply", Gaussians(*vars(read_model(tmp_path / "coded.sog")).values()))
-    data = (tmp_path / "cover.ply").read_bytes().replace(b"element vertex", COMMENTS + b"element vertex", 1)
-    (tmp_path / "cover.ply").write_bytes(data)
-    (tmp_path / "secret.txt").write_bytes(b"seven words")
-    arguments = ["--cover", tmp_path / "cover.ply", "--secret-file", tmp_path / "secret.txt"]
-    key = write_key(tmp_path / "key")
-    assert keyss("hide", *arguments, "--key-file", key, "-o", tmp_path / "run").status == 0
-    published = (tmp_path / "run" / "publish" / "model.ply").read_bytes()
-    assert published.partition(b"end_header")[0] == data.partition(b"end_header")[0]

@@ -122,17 +122,11 @@ class TestOpensNothing:
             assert word in result[0].err
 
 
-@pytest.mark.parametrize("how", ["same", "dots", "symlink", "hardlink"])
+@pytest.mark.parametrize("how", ["same", "symlink", "hardlink"])
 def test_input_is_never_overwritten(keyss: Run, files: Path, tmp_path: Path, how: str) -> None:
-    (tmp_path / "sub").mkdir()
     model = tmp_path / "stego.ply"
     shutil.copy(files / "whole.ply", model)
-    out = {
-        "same": model,
-        "dots": tmp_path / "sub" / ".." / "stego.ply",
-        "symlink": tmp_path / "link.ply",
-        "hardlink": tmp_path / "hard.ply",
-    }[how]
+    out = model if how == "same" else tmp_path / "link.ply"
     if how == "symlink":
         out.symlink_to(model)
     elif how == "hardlink":
@@ -203,17 +197,6 @@ class TestVerify:
         assert result.status == 4
         assert words in result.err
         assert "Gaussians of SH degree" in result.out
-
-    @pytest.mark.parametrize("where", ["file", "environment"])
-    def test_whole_secret(self, keyss: Run, files: Path, monkeypatch: pytest.MonkeyPatch, where: str) -> None:
-        arguments = ["--key-file", files / "key"]
-        if where == "environment":
-            monkeypatch.setenv("KEYSS_KEY", f"{KEY}\n")
-            arguments = []
-        result = keyss("verify", files / "whole.ply", *arguments, "--json")
-        assert (result.status, result.err) == (0, "")
-        (secret,) = json.loads(result.out)["secrets"]
-        assert (secret["found"], secret["hidden"]) == (500, 500)
 
     def test_invalid_model_with_whole_secret(self, keyss: Run, files: Path, tmp_path: Path) -> None:
         model = read_model(files / "whole.ply")

@@ -66,15 +66,6 @@ def test_several_pruned_secrets_have_numbers() -> None:
     assert ["Secret 2 kept 567 of 700 Gaussians."] in rows
 
 
-def test_one_psnr_of_one_thing() -> None:
-    """No second figure, over other views or averaged otherwise, stands beside the table's."""
-    with redirect_stdout(io.StringIO()) as out:
-        print_hiding(METRICS)
-    assert "32.0" not in out.getvalue()
-    assert "31.0" not in out.getvalue()
-    assert "Chance" not in out.getvalue()  # no decoder, so wrong keys give no renders
-
-
 def test_shorter_plain_model_is_no_bound() -> None:
     shorter = replace(METRICS.baseline, secrets=(ImageQuality(19.0, 0.2),))
     rows = table(replace(METRICS, baseline=shorter))
@@ -84,14 +75,6 @@ def test_shorter_plain_model_is_no_bound() -> None:
     ]
     assert rows[2] == ["secret", "20.00", "0.250", "19.00", "567", "20"]
     assert any("; start: PSNR of a plain model with fewer steps" in row[0] for row in rows)
-
-
-def test_every_table_has_a_legend() -> None:
-    shorter = replace(METRICS.baseline, secrets=(ImageQuality(19.0, 0.2),), gaussians=(1234, 8406))
-    with redirect_stdout(io.StringIO()) as out:
-        print_hiding(replace(METRICS, baseline=shorter), brief=True)
-    for word in ("bound", "loss", "start", "plain"):
-        assert f"; {word}: " in out.getvalue()
 
 
 @pytest.mark.parametrize(("highest", "unlearnt"), [(19.5, True), (12.0, False)])

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.harness import SMALL, Result, Run, scene_arguments
+from cli.harness import SMALL, Result, Run
 from keyss import progress
 from keyss.files import write_model
 from keyss.runs import planning
@@ -58,21 +58,11 @@ def test_verbose_prints_duration(keyss: Run, scene: Path, flag: str) -> None:
     assert "done in" not in keyss(flag, "info", scene.parent / "no.ply").err
 
 
-class TestEstimate:
-    """Announced if a run takes more than a minute."""
-
-    WORDS = r"about \d+ s on the CPU, \d\.\d GB of memory, up to \d+ MB of disk"
-
-    def test_fit(self, keyss: Run, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        assert "about" not in fit(keyss, scene).err
-        monkeypatch.setattr(planning, "_LONG", 0.0)
-        result = fit(keyss, scene, "--overwrite")
-        assert re.search(rf"^fit: {self.WORDS}\n.*fit b: 20 steps", result.err, re.DOTALL)
-        assert "about" not in fit(keyss, scene, "-q", "--overwrite").err
-
-    def test_hide(self, keyss: Run, workspace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(planning, "_LONG", 0.0)
-        hide = ("hide", *scene_arguments(workspace), "--publish", "converted", "-o", tmp_path / "out")
-        result = keyss(*hide, *SMALL, "--min-psnr", 0)
-        assert result.status == 0, result.err
-        assert re.search(rf"^hide: a file of up to \d+\.\d MB, {self.WORDS}\n", result.err, re.MULTILINE)
+def test_estimates_of_long_runs_are_announced(
+    keyss: Run, scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "about" not in fit(keyss, scene).err
+    monkeypatch.setattr(planning, "_LONG", 0.0)
+    words = r"about \d+ s on the CPU, \d\.\d GB of memory, up to \d+ MB of disk"
+    assert re.search(rf"^fit: {words}\n.*fit b: 20 steps", fit(keyss, scene, "--overwrite").err, re.DOTALL)
+    assert "about" not in fit(keyss, scene, "-q", "--overwrite").err

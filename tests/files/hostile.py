@@ -35,6 +35,7 @@ from files.scene_files import camera_bytes, counted, image_bytes, point_bytes
 from keyss.core import InputError
 from keyss.files import load_scene, read_model
 from keyss.files.images import png_names
+from keyss.files.ply_table import model_names, ply_header
 
 SECONDS, MEMORY, PER_BYTE = 5.0, 200 << 20, 32
 KHR = "KHR_gaussian_splatting"
@@ -134,12 +135,12 @@ def sog(bands: int) -> Callable[[int], Files]:
         k = (bands + 1) ** 2 - 1
         width = 4096
         height = min(16383, 4 * count // width)
-        blank = image_of(width, height)
+        blank = image("WEBP", width, height, **BLANK)
         part = {"files": ["i", "i"], "mins": [0] * 3, "maxs": [1] * 3, "codebook": [0.5]}
         meta = {"version": 2, "count": count, **dict.fromkeys(("means", "scales", "quats", "sh0"), part)}
         files = {"i": blank}
         if k:
-            files["p"] = image_of(64 * k, 1024)
+            files["p"] = image("WEBP", 64 * k, 1024, **BLANK)
             meta["shN"] = {"count": 65536, "bands": bands, "codebook": [0.5], "files": ["p", "i"]}
         data = io.BytesIO()
         with zipfile.ZipFile(data, "w") as archive:
@@ -152,90 +153,56 @@ def sog(bands: int) -> Callable[[int], Files]:
     return make
 
 
-def image_of(width: int, height: int) -> bytes:
-    from PIL import Image
-
-    found = io.BytesIO()
-    Image.new("RGBA", (width, height), (0, 0, 0, 255)).save(
-        found, "WEBP", lossless=True, exact=True, quality=0, method=0
-    )
-    return found.getvalue()
+BLANK = {"alpha": 255, "lossless": True, "exact": True, "quality": 0, "method": 0}
 
 
-def ply_header(properties: list[str], count: int, format: str = "binary_little_endian") -> bytes:
-    lines = ["ply", f"format {format} 1.0", f"element vertex {count}"]
-    lines += [f"property {each}" for each in properties]
-    return "\n".join([*lines, "end_header\n"]).encode()
+FLOATS = [f"float {name}" for name in model_names(1)]
 
 
-def names(degree: int) -> list[str]:
-    rest = [f"f_rest_{i}" for i in range(3 * (degree + 1) ** 2 - 3)]
-    shape = ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-    return ["x", "y", "z", *(f"f_dc_{i}" for i in range(3)), *rest, *shape]
+def ply_rows(properties: list[str], width: int) -> Callable[[int], Files]:
+    """Rows of `width` bytes."""
 
+    def make(size: int) -> Files:
+        count = size // width
+        return {"a.ply": ply_header({"vertex": (count, properties)}) + b"\xff" * width * count}
 
-def ply_bytes(size: int) -> Files:
-    """Properties of one byte."""
-    count = size // 59
-    return {"a.ply": ply_header([f"char {each}" for each in names(3)], count) + b"\xff" * 59 * count}
-
-
-def ply_mixed(size: int) -> Files:
-    """Properties of two types, which are converted one by one."""
-    listed = [f"{'short' if name == 'x' else 'char'} {name}" for name in names(3)]
-    count = size // 60
-    return {"a.ply": ply_header(listed, count) + b"\xff" * 60 * count}
-
-
-def ply_properties(size: int) -> Files:
-    """A header as long as it may be: rows of thousands of properties."""
-    extra = [f"char p{i:04}" for i in range(2900)]
-    count = size // (14 + len(extra))
-    header = ply_header([f"char {each}" for each in names(0)] + extra, count)
-    return {"a.ply": header + b"\xff" * (14 + len(extra)) * count}
+    return make
 
 
 def ply_elements(size: int) -> Files:
     """Thousands of elements without a byte."""
-    header = ply_header([f"char {each}" for each in names(0)], size // 14)
-    many = b"".join(b"element %d 9999999999\n" % i for i in range(2000))
-    return {
-        "a.ply": header.replace(b"element vertex", many + b"element vertex") + b"\xff" * 14 * (size // 14)
-    }
+    many = {f"{i}": (9999999999, []) for i in range(2000)}
+    header = ply_header({**many, "vertex": (size // 14, [f"char {name}" for name in model_names(1)])})
+    return {"a.ply": header + b"\xff" * 14 * (size // 14)}
 
 
-def ply_text(separator: str, value: str) -> Callable[[int], Files]:
+def ply_text(value: str, between: str = " ") -> Callable[[int], Files]:
+    """Rows of equal numbers."""
+
     def make(size: int) -> Files:
-        count = size // (14 * len(value + separator))
-        rows = ((value + separator) * 14 * count).encode()
-        return {"a.ply": ply_header([f"float {each}" for each in names(0)], count, "ascii") + rows}
+        count = size // (14 * len(value + between))
+        header = ply_header({"vertex": (count, FLOATS)}).replace(b"binary_little_endian", b"ascii")
+        return {"a.ply": header + ((value + between) * 14 * count).encode()}
 
     return make
 
 
 def ply_long_number(size: int) -> Files:
-    rows = b"1 " * 13 + b"1" * (size - 26)
-    return {"a.ply": ply_header([f"float {each}" for each in names(0)], 1, "ascii") + rows}
+    header = ply_header({"vertex": (1, FLOATS)}).replace(b"binary_little_endian", b"ascii")
+    return {"a.ply": header + b"1 " * 13 + b"1" * (size - 26)}
 
 
 def compressed_ply(size: int) -> Files:
     """Without bytes for bounds, as far as that goes: all of it Gaussians with harmonics."""
-    count = (size - 3000) // (16 + 45)
-    count -= count % 256
-    chunks = count // 256
-    ends = [
-        f"{end}_{axis}"
-        for part in ("x y z", "scale_x scale_y scale_z")
-        for end in ("min", "max")
-        for axis in part.split()
-    ]
-    lines = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}"]
-    lines += [f"property float {name}" for name in ends]
-    lines += [f"element vertex {count}"]
-    lines += [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
-    lines += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(45))]
-    header = "\n".join([*lines, "end_header\n"]).encode()
-    return {"a.compressed.ply": header + np.ones(12 * chunks, "<f4").tobytes() + bytes(count * 61)}
+    chunks = (size - 3000) // (16 + 45) // 256
+    count, parts = 256 * chunks, ("x", "y", "z", "scale_x", "scale_y", "scale_z")
+    elements = {
+        "chunk": (chunks, [f"float {end}_{part}" for part in parts for end in ("min", "max")]),
+        "vertex": (count, [f"uint packed_{name}" for name in ("position", "rotation", "scale", "color")]),
+        "sh": (count, [f"uchar f_rest_{i}" for i in range(45)]),
+    }
+    rows = np.ones(12 * chunks, "<f4").tobytes() + bytes(count * 61)
+    return {"a.compressed.ply": ply_header(elements) + rows}
 
 
 def splat(size: int) -> Files:
@@ -374,7 +341,8 @@ def json_points(size: int) -> Files:
         "transforms.json", f'{{"w":16,"h":16,"fl_x":16,"ply_file_path":"p.ply","frames":[{own}]}}'.encode()
     )
     count = size // 3
-    return found | {"p.ply": ply_header([f"uchar {each}" for each in "xyz"], count) + bytes(3 * count)}
+    points = ply_header({"vertex": (count, [f"uchar {each}" for each in "xyz"])}) + bytes(3 * count)
+    return found | {"p.ply": points}
 
 
 def png(size: int) -> Files:
@@ -398,13 +366,15 @@ HOSTILE: dict[str, Callable[[int], Files]] = {
     "spz: version 4": spz4,
     "sog: degree 0": sog(0),
     "sog: degree 3": sog(3),
-    "ply: bytes": ply_bytes,
-    "ply: two types": ply_mixed,
-    "ply: properties": ply_properties,
+    "ply: bytes": ply_rows([f"char {name}" for name in model_names(16)], 59),
+    "ply: two types": ply_rows(["short x", *(f"char {name}" for name in model_names(16)[1:])], 60),
+    "ply: properties": ply_rows(
+        [f"char {name}" for name in (*model_names(1), *(f"p{i:04}" for i in range(2900)))], 2914
+    ),
     "ply: elements": ply_elements,
-    "ply: text in one line": ply_text(" ", "-1"),
-    "ply: text, longer numbers": ply_text(" ", "-.1"),
-    "ply: text, a line each": ply_text("\n", "-1"),
+    "ply: text in one line": ply_text("-1"),
+    "ply: text, longer numbers": ply_text("-.1"),
+    "ply: text, a line each": ply_text("-1", "\n"),
     "ply: a long number": ply_long_number,
     "compressed ply": compressed_ply,
     "splat": splat,

@@ -74,23 +74,6 @@ def test_agrees_with_pycolmap(real_data: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(ours.viewmat, theirs.viewmat, atol=1e-12)
 
 
-@pytest.mark.parametrize("width", [200])
-def test_points_project_to_their_observations(real_data: Path, width: int | None) -> None:
-    reconstruction = pycolmap.Reconstruction(real_data / "fox" / "sparse" / "0")
-    by_name = {image.name: image for image in reconstruction.images.values()}
-    scene = load_scene(real_data / "fox", width=width)
-    assert (len(scene.train), len(scene.test)) == (43, 7)
-    for view in scene.views:
-        seen = [p for p in by_name[view.camera.name].points2D if p.has_point3D()]
-        world = np.array([reconstruction.points3D[p.point3D_id].xyz for p in seen])
-        observed = np.array([p.xy for p in seen]) * (view.camera.width / 540, view.camera.height / 960)
-        viewmat, K = view.camera.viewmat.double().numpy(), view.camera.K.double().numpy()
-        projected = (world @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
-        error = projected[:, :2] / projected[:, 2:] - observed
-        assert np.linalg.norm(error, axis=1).mean() < view.camera.width / 540
-        assert view.image.shape == (view.camera.height, view.camera.width, 3)
-
-
 def test_text_models(tmp_path: Path) -> None:
     folder = write_colmap(tmp_path / "scene")
     model = folder / "sparse" / "0"

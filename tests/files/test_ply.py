@@ -317,11 +317,3 @@ def test_gsply_round_trip(tmp_path: Path, degree: int) -> None:
         gaussians.sh[:, 1:].numpy() if degree else None,
     )
     assert read_model(tmp_path / "b.ply").digest() == gaussians.digest()
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_splat_transform_round_trip(splat_transform: Transform, tmp_path: Path, degree: int) -> None:
-    gaussians = random_gaussians(40, sh_degree=degree)
-    write_model(tmp_path / "in.ply", gaussians)
-    copy = splat_transform(tmp_path / "in.ply", tmp_path / "out.ply")
-    assert read_model(copy).digest() == gaussians.digest()

@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 
 from files.formats.examples import model_of
-from keyss.core import InputError
 from keyss.files import read_model, write_model
-from keyss.files.ply_summary import NEARLY_TRANSPARENT, summarise_ply
-from keyss.files.ply_table import model_names, ply_header
+from keyss.files.ply_table import NEARLY_TRANSPARENT, model_names, ply_header, summarise_ply
 
 VALUES = (np.nan, np.inf, -np.inf, 3e38, -3e38)  # sums of the last two overflow
 
@@ -50,19 +48,6 @@ def test_summary_matches_model(tmp_path: Path, seed: int, kind: str) -> None:
     assert summary.low.tolist() == model.means.amin(0).tolist()
     assert summary.high.tolist() == model.means.amax(0).tolist()
     assert summary.nearly_transparent == int((model.opacity_logits < NEARLY_TRANSPARENT).sum())
-
-
-def test_activated_models_are_refused(tmp_path: Path) -> None:
-    model = model_of(2000, 1)
-    write_model(
-        tmp_path / "a.ply", type(model)(model.means, model.quats, model.scales, model.opacities, model.sh)
-    )
-    messages = []
-    for read in (read_model, summarise_ply):
-        with pytest.raises(InputError, match="those that renderers use") as refused:
-            read(tmp_path / "a.ply")
-        messages.append(str(refused.value))
-    assert messages[0] == messages[1]
 
 
 def test_other_files_have_no_summary(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from channels.lsb.trained_like import trained_like
-from keyss.core import BackendError, Gaussians, Scene, UsageError
+from keyss.core import Gaussians, Scene, UsageError
 from keyss.fitting import mean_psnr
 from keyss.lab import (
     Converter,
@@ -18,14 +18,11 @@ from keyss.lab import (
     cropping,
     fewer_harmonics,
     fine_tuning,
-    half_floats,
-    measure_robustness,
     noise,
     opacity_pruning,
     purification,
     random_pruning,
 )
-from lab.known_scene import Whole
 from tiny_scenes import random_gaussians, tiny_scene
 
 NOISY = ("position", "log scale", "quaternion", "logit opacity", "colour", "harmonics")
@@ -165,14 +162,3 @@ def test_splat_transform_converts(format: str, splat_transform: Callable[..., Pa
     assert len(back) == 60
     assert float(torch.cdist(back.means, model.means).amin(1).max()) < 0.01
     assert back.sh_degree == (0 if format == ".splat" else 3)
-
-
-def test_missing_converter_is_skipped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scene: Scene) -> None:
-    monkeypatch.setenv("KEYSS_SPLAT_TRANSFORM", str(tmp_path / "nowhere"))
-    model, change = random_gaussians(seed=0), by(".sog", "splat-transform").change()
-    with pytest.raises(BackendError, match="npm install"):
-        change(model)
-    rows = measure_robustness(model, [Whole], [scene, scene], changes=[change, half_floats()])
-    assert "splat-transform is not installed" in (rows[1].skipped or "")
-    assert rows[1].cover is None
-    assert rows[2].skipped is None

@@ -2,25 +2,43 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from statistics import fmean
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 import torch
 
 import keyss
 from keyss import CarryOptions
-from keyss.core import Gaussians, KeyssWarning, Scene, Similarity, UsageError, WrongKeyError
+from keyss.core import BackendError, Gaussians, KeyssWarning, Scene, Similarity, UsageError, WrongKeyError
 from keyss.fitting import mean_psnr
-from keyss.lab import ChangedQuality, half_floats, measure_robustness, purification, random_pruning
+from keyss.lab import (
+    ChangedQuality,
+    converters,
+    half_floats,
+    measure_robustness,
+    purification,
+    random_pruning,
+)
 from keyss.methods import HiddenScene, open_model
-from lab.known_scene import Whole
 from methods.carry.test_fine_tuning import TINY
 from methods.hiding import hide_scenes, moved, three_scenes
 from tiny_scenes import random_gaussians, tiny_scene
 
 KEY = "the right key"
+
+
+@dataclass(frozen=True)
+class Whole:
+    """A `HiddenScene` with a known model."""
+
+    gaussians: Gaussians
+    frame: Similarity | None = None
+
+    def reveal(self, stego: Gaussians, **_: Any) -> Gaussians:
+        return self.gaussians
 
 
 @pytest.fixture(scope="module")
@@ -32,10 +50,8 @@ def test_loss_is_the_difference_of_psnr(scene: Scene) -> None:
     """The secret is the cover, so every number is known; two seeds of one change give their mean."""
     model = random_gaussians(seed=0)
     changes = [random_pruning(0.5, seed) for seed in (0, 1)]
-    steps: list[tuple[int, int]] = []
-    rows = measure_robustness(
-        model, [Whole], [scene, scene], changes=changes, progress=lambda *step: steps.append(step)
-    )
+    shares: list[float] = []
+    rows = measure_robustness(model, [Whole], [scene, scene], changes=changes, share=shares.append)
     assert [(row.attack, row.seeds) for row in rows] == [("none", 1), ("random pruning", 2)]
     before = mean_psnr(model, scene.test, scene.background)
     assert rows[0].cover == rows[0].secrets[0] == ChangedQuality(before, 0)
@@ -43,7 +59,7 @@ def test_loss_is_the_difference_of_psnr(scene: Scene) -> None:
     assert rows[1].cover is not None
     assert (rows[1].cover.psnr, rows[1].cover.loss) == pytest.approx((after, before - after))
     assert rows[1].secrets == (rows[1].cover,)
-    assert steps == [(0, 300), (100, 300), (200, 300)]
+    assert shares == [0, 1 / 3, 2 / 3]
     assert measure_robustness(model, [Whole], [scene, scene], changes=changes) == rows
 
 
@@ -69,6 +85,18 @@ def test_lost_secret_is_at_chance_level(scene: Scene) -> None:
         measure_robustness(model, [], [scene, scene], changes=[])
     with pytest.raises(WrongKeyError):
         measure_robustness(model[:5], [opener], [scene, elsewhere], changes=[])
+
+
+def test_missing_converter_is_skipped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scene: Scene) -> None:
+    monkeypatch.setenv("KEYSS_SPLAT_TRANSFORM", str(tmp_path / "nowhere"))
+    (sog,) = (converter for converter in converters() if converter.format == ".sog")
+    model, change = random_gaussians(seed=0), sog.change()
+    with pytest.raises(BackendError, match="npm install"):
+        change(model)
+    rows = measure_robustness(model, [Whole], [scene, scene], changes=[change, half_floats()])
+    assert "splat-transform is not installed" in (rows[1].skipped or "")
+    assert rows[1].cover is None
+    assert rows[2].skipped is None
 
 
 # --- hidden secrets --------------------------------------------------------------------------------------

@@ -65,13 +65,16 @@ def test_fog_is_ignored(distance: float, size: float) -> None:
     assert 0.5 < surrounded.radius / alone.radius < 1.5
 
 
+def long_subject(count: int) -> Gaussians:
+    """The subject below a long thin neck of this many Gaussians."""
+    neck = subject(count, 3)
+    along = torch.linspace(0.6, 4, count)[:, None] * torch.tensor([0.0, -1, 0])
+    return Gaussians.cat([subject(), replace(neck, means=0.1 * neck.means + along)])
+
+
 def test_long_subject_is_whole() -> None:
     """A long object is not cut where most of its Gaussians are."""
-    neck = subject(600, 3)
-    neck = replace(
-        neck, means=0.1 * neck.means + torch.linspace(0.6, 4, 600)[:, None] * torch.tensor([0.0, -1, 0])
-    )
-    frame = frame_of(Gaussians.cat([subject(), neck]))
+    frame = frame_of(long_subject(600))
     assert (torch.from_numpy(frame.middle) - torch.tensor([0.0, -4, 0])).norm() < frame.radius + 0.1
 
 

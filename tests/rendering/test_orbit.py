@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
 import torch
 
-from keyss.core import Gaussians, camera_positions
+from keyss.core import camera_positions
 from keyss.rendering import frame_of
 from keyss.rendering.orbit import orbit, turntable
-from rendering.test_framing import FLOORS, on_a_floor, subject
+from rendering.test_framing import FLOORS, long_subject, on_a_floor
 from tiny_scenes import random_gaussians
 
 SIZE = 48
@@ -34,25 +31,8 @@ def test_orbit() -> None:
     assert (camera_positions(cameras) - middle).norm(dim=1).min() > radius
 
 
-def test_faint_and_distant_gaussians_are_ignored() -> None:
-    model = random_gaussians(500)
-    frame = frame_of(model)
-    far = replace(model[:2], means=model[:2].means * 1000 + 500)
-    faint = replace(model[:100], means=model[:100].means + 50, opacity_logits=torch.full((100,), -12.0))
-    moved = frame_of(Gaussians.cat([model, far, faint]))
-    assert np.linalg.norm(moved.middle - frame.middle) < 0.2 * frame.radius
-    assert moved.radius < 1.3 * frame.radius
-
-
-def long_subject() -> Gaussians:
-    """A dense ball below a long thin neck, which has few of the Gaussians."""
-    neck = subject(300, 3)
-    along = torch.linspace(0.6, 4, 300)[:, None] * torch.tensor([0.0, -1, 0])
-    return Gaussians.cat([subject(), replace(neck, means=0.1 * neck.means + along)])
-
-
 def test_turntable_shows_all_of_an_object() -> None:
-    model, filled = long_subject(), []
+    model, filled = long_subject(300), []
     for camera in turntable(model, SIZE):
         x, y, z = (model.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).T
         places = torch.stack([x, y]) / z * camera.K[0, 0] / (SIZE / 2)  # edges of the view at -1 and 1

@@ -5,11 +5,9 @@ from __future__ import annotations
 import warnings
 from pathlib import Path
 
-import pytest
-
 from files.formats.examples import model_of
 from keyss.files import write_model
-from keyss.runs.estimates import gaussians_in, seconds_for, seconds_to_convert, seconds_to_prepare
+from keyss.runs.estimates import gaussians_in
 
 
 def test_estimated_model_sizes(tmp_path: Path) -> None:
@@ -24,16 +22,3 @@ def test_estimated_model_sizes(tmp_path: Path) -> None:
         assert 10_000 < gaussians_in(tmp_path / name) < 40_000
     for name in ("-", "missing.ply", "a/b"):
         assert gaussians_in(Path(name)) == 0
-
-
-def test_times_grow_with_models_and_secrets(tmp_path: Path) -> None:
-    small, large = tmp_path / "a.ply", tmp_path / "b.ply"
-    write_model(small, model_of(100, 0))
-    write_model(large, model_of(30_000, 0))
-    for task in ("info", "verify", "reveal", "hide a file", "export", "render"):
-        assert seconds_for(task, small) < seconds_for(task, large)
-    one, two = (seconds_to_convert(large, Path("c.compressed.ply"), keys) for keys in (0, 1))
-    assert seconds_to_convert(large, Path("c.ply"), 0) < one < two
-    assert seconds_to_prepare([small, None, large, "missing"]) == pytest.approx(
-        seconds_for("prepare", small) + seconds_for("prepare", large) - seconds_for("prepare", Path("none"))
-    )

@@ -198,11 +198,3 @@ def test_symlinks_are_not_followed(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="leads out of"):
         write_run(run, overwrite=True)
     assert (elsewhere / "model.ply").read_bytes() == b"mine"
-
-
-def test_names_that_are_not_text(tmp_path: Path) -> None:
-    """Python represents undecodable bytes of file names by surrogates."""
-    arguments: dict[str, object] = {"cover": b"K\xfcche.ply".decode("utf-8", "surrogateescape")}
-    interrupt(tmp_path, arguments)
-    write_run(tmp_path, arguments=arguments, resume=True)
-    assert set(read_files(tmp_path)) == {"publish/model.ply", "private/cover.ply"}

@@ -17,7 +17,6 @@ from channels.lsb.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Secret
 from keyss.core import OutputError
 from keyss.files import write_model
-from keyss.methods import registry
 from keyss.runs import planning
 from keyss.runs.folder import RunFolder
 from methods.keyss.small import small
@@ -40,19 +39,6 @@ def test_sizes_and_steps(tmp_path: Path) -> None:
     assert plan.sh_degree == 3
     assert plan.capacity < plan.secret_gaussians == 800
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.filterwarnings("ignore:.*appended Gaussians")
-def test_steps_with_networks_take_longer() -> None:
-    seconds = []
-    fit = replace(FIT, iterations=1_000_000)
-    hider = registry.get("gs-hider").options(fit=fit)
-    second = registry.get("3dgs-sh").options(fit=fit)
-    for options, key in ((second, ""), (small("published", fit), KEY), (hider, "")):
-        cost = keyss.hide(tiny_scene(0), [Secret(tiny_scene(1), key)], method=options, dry_run=True).cost
-        seconds.append(cost.seconds - sum(cost.fit_seconds))
-    harmonics, published, networks = seconds
-    assert 2 * harmonics < published < networks
 
 
 def test_bound_takes_longer() -> None:

@@ -86,12 +86,3 @@ def test_checkpoints_are_private(tmp_path: Path) -> None:
     assert any("checkpoint" in name and name.endswith(".safetensors") for name in modes)
     assert set(modes.values()) == {0o700, 0o600}
     assert {path.name for path in run.iterdir()} == {"private"}
-
-
-def test_revealed_models_are_private(tmp_path: Path) -> None:
-    run = _hide(tmp_path, METHODS["carry"])
-    keyss.reveal(run / "publish" / "model.ply", KEY, out=tmp_path / "revealed.ply")
-    assert _modes(tmp_path / "revealed.ply") == {"revealed.ply": 0o600}
-    (run / "private").chmod(0o755)
-    keyss.evaluate(run, [KEY])
-    assert set(_modes(run / "private").values()) == {0o700, 0o600}

@@ -16,7 +16,7 @@ from keyss.files.atomic import mode_like, write_bytes
 from keyss.files.file_kinds import model_file
 from keyss.files.formats.ply import with_extras
 from keyss.files.inputs import is_standard, write_standard_output
-from keyss.files.models import check_model_output, holds, keeps_low_bits, model_bytes, model_of_bytes
+from keyss.files.models import check_model_output, keeps_low_bits, model_bytes, model_of_bytes, reads_as
 from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_visible, psnr_between
 from keyss.runs.files import PathLike, as_model, is_published
@@ -83,7 +83,7 @@ def convert(
     before = as_model(model if source is None else source)
     opened = [reveal_secret(before, key, target) for key in keys]
     data = model_bytes(path, with_extras(before, source, before))
-    after = before if holds(path, data, before) else model_of_bytes(path, data)  # a copy takes memory
+    after = before if reads_as(path, before, data) else model_of_bytes(path, data)  # a copy takes memory
     secrets = tuple(
         KeptSecret(
             secret.recovered.found, _size_left(after, key, target), "bytes" if secret.file else "Gaussians"

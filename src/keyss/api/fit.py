@@ -9,12 +9,12 @@ from pathlib import Path
 
 from keyss.core.errors import InputError
 from keyss.core.scene import Scene, ViewOptions
-from keyss.files.models import is_model_source
 from keyss.fitting.config import FitConfig, preset_for
 from keyss.fitting.image_metrics import quality
 from keyss.fitting.plain import FitResult, fit_scene
 from keyss.progress import Reporter, reporter as default_reporter
 from keyss.rendering import Backend, resolve_device
+from keyss.rendering.orbit import is_model
 from keyss.runs.files import CONFIG, METRICS, MODEL, PathLike, as_scene, path_of
 from keyss.runs.folder import RunFolder
 from keyss.runs.planning import check_room, cost_of_fit
@@ -41,7 +41,7 @@ def fit(
     `keyss.progress.Reporter()` is silent. Raises KeyssError, and Interrupted on Ctrl-C.
     """
     started, reporter = time.monotonic(), reporter or default_reporter()
-    if not isinstance(scene, Scene) and is_model_source(scene):
+    if is_model(scene):
         raise InputError(f"{scene}: expected a folder of posed photos, found a 3DGS model")
     interrupted = Path(out) if resume and out is not None else None
     target = resolve_device(device)

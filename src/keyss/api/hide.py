@@ -8,23 +8,21 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from keyss.api.hide_arguments import (
-    Given,
     HideResult,
     Secret,
     SecretFile,
     check_arguments,
     check_not_given,
     method_for,
+    read_sources,
+    with_renders,
 )
 from keyss.api.hide_files import hide_files
-from keyss.api.hide_metrics import PlainModel, check_quality, compare_with, hide_metrics
+from keyss.api.hide_metrics import PlainModel, check_quality, hide_metrics
 from keyss.channels import Publish
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, ViewOptions
@@ -32,16 +30,16 @@ from keyss.files.formats.ply import with_extras
 from keyss.files.models import read_model, reads_as
 from keyss.keys import DerivedKey
 from keyss.keys.derivation import SALT_BYTES
+from keyss.measure.hide_quality import compare
 from keyss.measure.renders import sheet_of
-from keyss.methods.companion import pack
-from keyss.methods.hidden import HiddenScene
-from keyss.methods.method import Context, Method, MethodOptions, Prepared, Source, Stego, role_of
-from keyss.methods.plain_models import fit_bounds, fit_plain_models
+from keyss.methods.hidden import HiddenScene, pack_companion
+from keyss.methods.method import Context, MethodOptions, Prepared, Source, Stego
+from keyss.methods.plain_models import fit_bound, fit_plain_models
 from keyss.methods.registry import DEFAULT, open_companion, open_model
 from keyss.progress import Reporter, reporter as default_reporter
 from keyss.rendering import Backend, resolve_device
-from keyss.rendering.orbit import from_above
-from keyss.runs.estimates import seconds_to_prepare
+from keyss.rendering.orbit import is_model
+from keyss.runs.estimates import seconds_for
 from keyss.runs.files import (
     CONFIG,
     LOOK,
@@ -51,6 +49,7 @@ from keyss.runs.files import (
     bound_names,
     companion_names,
     path_of,
+    plain_names,
     stego_name,
 )
 from keyss.runs.folder import RunFolder
@@ -91,7 +90,7 @@ def hide(
 
     `out` (a folder) gets `publish/` with the stego model, and `private/` with fitted models, `config.json`,
     `metrics.json`, `look.png` (test views of cover and secrets before and after), companion files for methods
-    that need them (`keyss.methods.companion`), and checkpoints, from which `resume` continues. Without a seed
+    that need them (`keyss.methods.hidden`), and checkpoints, from which `resume` continues. Without a seed
     in the options' `fit` the run uses a random one, which `config.json` records. With a seed, the same
     arguments and number of threads give the same bytes on a CPU.
 
@@ -113,21 +112,45 @@ def hide(
     check_arguments(out, min_psnr)
     place = None if out is None else Path(out)
     if files := [secret for secret in secrets if isinstance(secret, SecretFile)]:
-        check_not_given(cover_model=cover_model, bound=bound, min_psnr=min_psnr, resume=resume)
+        check_not_given(
+            cover_model=cover_model, bound=bound, min_psnr=min_psnr, resume=resume, seed=options.fit.seed
+        )
         return hide_files(cover, files, options, place, overwrite, dry_run, reporter)
-    given = Given.of(cover, cover_model, [secret for secret in secrets if isinstance(secret, Secret)])
+    given = [Secret(cover, "", cover_model), *(secret for secret in secrets if isinstance(secret, Secret))]
+    keys = [secret.key for secret in given[1:]]
     options = replace(options, fit=with_seed(options.fit, place if resume else None, "options", "fit"))
-    settings = _settings(chosen, given, views, options)
+    settings = RunConfig(
+        method=chosen.name,
+        cover=path_of(cover),
+        secrets=tuple(path_of(secret.scene) for secret in given[1:]),
+        models_given=tuple(one.model is not None or is_model(one.scene) for one in given),
+        views=views,
+        payloads=(),
+        options=options,
+    )
+    inputs = [Path(path) for one in given for path in (one.scene, one.model) if isinstance(path, str | Path)]
     folder = None
     if place is not None and not dry_run:
-        folder = _folder(place, settings, given, bound, overwrite, resume)
+        # Verifiers of the keys: guessing a key from one is as slow as from the stego model.
+        salt = hashlib.sha256(b"keyss/v1/resume" + record_bytes(settings)).digest()[:SALT_BYTES]
+        verifiers = [DerivedKey.of(key, salt).verifier().hex() for key in keys if key]
+        models_given = [one.model and path_of(one.model) for one in given]
+        folder = RunFolder(
+            place,
+            "hide",
+            {**asdict(settings), "models": models_given, "bound": bound, "keys": verifiers},
+            onto=("scenes",),
+            writes=(*STEGOS, CONFIG),
+            inputs=inputs,
+            overwrite=overwrite,
+            resume=resume,
+        )
         began -= folder.earlier_seconds
-    with reporter.waiting("reading the cover and the secrets", seconds_to_prepare(given.paths)):
-        sources = given.read(views)
+    with reporter.waiting("reading the cover and the secrets", seconds_for("prepare", *inputs)):
+        sources = read_sources(given, views)
         prepared = chosen.prepare(sources, options)
-        plain_steps = given.plain_steps(sources, prepared.fits)
         trains = not dry_run and (prepared.trains or any(source.given is None for source in sources))
-        sources = given.with_renders(sources, views, train=trains)
+        sources = with_renders(given, sources, views, train=trains)
     cost = cost_of(prepared, sources, target, bound=bound)
     check_room(cost, place)
     if dry_run:
@@ -145,9 +168,13 @@ def hide(
         if any(source.given is None for source in sources):
             sources = fit_plain_models(sources, prepared.fits, context)
             prepared = chosen.prepare(sources, options, prepared)
-        context = replace(context, entropy=_entropy(given.keys, prepared.options, sources))
-        plain = list(map(PlainModel.of, sources, prepared.training, plain_steps))
-        results: dict[str, Any] = {**given.models_to_write(sources)}
+        context = replace(context, entropy=_entropy(keys, prepared.options, sources))
+        plain = list(map(PlainModel.of, sources, prepared.training))
+        results: dict[str, Any] = {  # plain models that the user did not give as files
+            name: source.model
+            for name, source, one in zip(plain_names(len(keys)), sources, given, strict=True)
+            if source.photos or isinstance(one.scene, Gaussians)
+        }
         # Test renders replace given models, which frees memory for the revealed ones.
         handed, plain_cover = sources, sources[0].model
         sources = [source if source.photos else replace(source, given=None) for source in sources]
@@ -156,61 +183,22 @@ def hide(
         published = with_extras(stego.gaussians, cover if cover_model is None else cover_model, plain_cover)
         del plain_cover
         with reporter.waiting("reading the published file, and comparing renders", cost.check_seconds):
-            models = _write_and_read(stego, published, given.keys, folder)
-            shown = list(map(partial(compare_with, target), sources, models))
+            models = _write_and_read(stego, published, keys, folder)
+            shown = [
+                compare(model.to(target), source.given, source.scene, of_plain=not source.photos)
+                for model, source in zip(models, sources, strict=True)
+            ]
         check_quality(shown, min_psnr, models, plain, prepared, resumes=trains)
         longer = _fit_bounds(plain, sources, models, prepared, context) if bound else {}
         with reporter.waiting("measuring, and writing private files", cost.view_seconds):
             metrics = hide_metrics(stego, models, sources, shown, plain, longer, prepared, target)
             metrics = replace(metrics, seconds=round(time.monotonic() - began, 1))
             if folder:
-                results |= {bound_names(len(secrets))[index]: model for index, model in longer.items()}
+                results |= {bound_names(len(keys))[index]: model for index, model in longer.items()}
                 settings = replace(settings, payloads=secret_ids(metrics.seed, stego.opened))
-                look = _look(models, sources, target)
+                look = sheet_of([model.to(target) for model in models], sources)
                 folder.write(results | {CONFIG: settings, METRICS: metrics, LOOK: look})
     return HideResult(stego.gaussians, metrics, survives=prepared.survives)
-
-
-def _settings(
-    method: Method, given: Given, views: ViewOptions, options: MethodOptions
-) -> RunConfig[MethodOptions]:
-    """The content of `config.json` known at the start."""
-    return RunConfig(
-        method=method.name,
-        cover=path_of(given.scenes[0]),
-        secrets=tuple(map(path_of, given.scenes[1:])),
-        models_given=tuple(
-            model is not None or not photos for model, photos in zip(given.models, given.photos, strict=True)
-        ),
-        views=views,
-        payloads=(),
-        options=options,
-    )
-
-
-def _folder(
-    place: Path,
-    settings: RunConfig[MethodOptions],
-    given: Given,
-    bound: bool,
-    overwrite: bool,
-    resume: bool,
-) -> RunFolder:
-    """The folder of the run; `resume` needs equal settings, models and keys."""
-    # Verifiers of the keys: guessing a key from one is as slow as from the stego model.
-    salt = hashlib.sha256(b"keyss/v1/resume" + record_bytes(settings)).digest()[:SALT_BYTES]
-    verifiers = [DerivedKey.of(key, salt).verifier().hex() for key in given.keys if key]
-    models = [model and path_of(model) for model in given.models]
-    return RunFolder(
-        place,
-        "hide",
-        {**asdict(settings), "models": models, "bound": bound, "keys": verifiers},
-        onto=("scenes",),
-        writes=(*STEGOS, CONFIG),
-        inputs=given.paths,
-        overwrite=overwrite,
-        resume=resume,
-    )
 
 
 def _entropy(keys: Sequence[str], options: MethodOptions, sources: Sequence[Source]) -> bytes:
@@ -233,7 +221,7 @@ def _write_and_read(
 ) -> list[Gaussians]:
     """Write the files to give away, `published` among them, and read the stego model and the secrets back."""
     model, same = stego.gaussians, type(stego.gaussians) is Gaussians
-    packed = [pack(payload) for payload in stego.companions]
+    packed = [pack_companion(payload) for payload in stego.companions]
     if folder:
         companions = dict(zip(companion_names(len(packed)), packed, strict=True))
         name = stego_name(model)
@@ -258,27 +246,12 @@ def _fit_bounds(
     context: Context,
 ) -> dict[int, Gaussians]:
     """Upper bounds for scenes with more training steps than their plain models, by index."""
-    configs = {
+    fit, bounds = prepared.options.fit, {}
+    for index, (before, source, model) in enumerate(zip(plain, sources, models, strict=True)):
+        if before.is_bound or before.total_steps is None or not source.photos:
+            continue
         # The upper bound of a pruned secret has the size of what is left.
-        index: before.bound.config(
-            prepared.options.fit, len(model) if len(model) < before.gaussians else None
-        )
-        for index, (before, source, model) in enumerate(zip(plain, sources, models, strict=True))
-        if not before.bound.equal and before.bound.steps is not None and source.photos
-    }
-    return fit_bounds([source.scene for source in sources], configs, context)
-
-
-def _look(models: Sequence[Gaussians], sources: Sequence[Source], device: torch.device) -> bytes:
-    """A PNG of test views before and after."""
-    return sheet_of(
-        [
-            (
-                role_of(index, len(sources)),
-                "photo" if source.photos else "given model",
-                source.scene if source.photos else from_above(source.scene),
-                model.to(device),
-            )
-            for index, (source, model) in enumerate(zip(sources, models, strict=True))
-        ]
-    )
+        size = max(16, len(model)) if len(model) < before.gaussians else fit.max_gaussians
+        config = replace(fit, iterations=before.total_steps, max_gaussians=size)
+        bounds[index] = fit_bound(source.scene, config, index, context)
+    return bounds

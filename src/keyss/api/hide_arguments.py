@@ -14,12 +14,11 @@ from keyss.core.errors import UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.scene import Scene, ViewOptions
 from keyss.files.models import is_model_path
-from keyss.fitting.config import FitConfig
 from keyss.keys import normalized_key
 from keyss.methods import registry
 from keyss.methods.method import Method, MethodOptions, Plan, Source
 from keyss.rendering.orbit import is_model
-from keyss.runs.files import METRICS, MODEL, PathLike, as_3dgs_model, as_scene, path_of, plain_names
+from keyss.runs.files import METRICS, MODEL, PathLike, as_3dgs_model, as_scene, path_of
 from keyss.runs.json_records import read_record
 from keyss.runs.planning import Cost
 from keyss.runs.run_records import FitMetrics, HideMetrics
@@ -114,85 +113,44 @@ def check_not_given(**for_scenes: object) -> None:
             raise UsageError(f"`{name}` is for hidden scenes, not for files: leave it out")
 
 
-@dataclass(frozen=True)
-class Given:
-    """The cover and the secrets as they were given, the cover first."""
+def read_sources(given: Sequence[Secret], views: ViewOptions) -> list[Source]:
+    """Read photos and models of the cover and the secrets. Raises UsageError and InputError."""
+    names = ["the cover"] + ["the secret"] * (len(given) - 1)
+    places = list(map(_place_of_model, given, names))
+    # Reading large files takes seconds each, mostly without the GIL.
+    with ThreadPoolExecutor(_READERS) as readers:
+        models = readers.map(_read_visible, places, names)
+        scenes = [None if is_model(one.scene) else as_scene(one.scene, views) for one in given]
+        sources = []
+        for one, place, scene, model in zip(given, places, scenes, models, strict=True):
+            if model is not None and scene is not None and place is not None:
+                model = in_frame_of(scene, scene.to_scene_frame(model), place, one.scene)
+            sources.append(Source(model, scene is not None, one.key, scene, _steps_of(one.model)))
+    return sources
 
-    scenes: tuple[PathLike | Scene | Gaussians, ...]
-    models: tuple[PathLike | Gaussians | None, ...]  # plain models
-    keys: tuple[str, ...]  # one per secret
 
-    @staticmethod
-    def of(
-        cover: PathLike | Scene | Gaussians,
-        cover_model: PathLike | Gaussians | None,
-        secrets: Sequence[Secret],
-    ) -> Given:
-        scenes = (cover, *(secret.scene for secret in secrets))
-        models = (cover_model, *(secret.model for secret in secrets))
-        return Given(scenes, models, tuple(secret.key for secret in secrets))
+def _place_of_model(given: Secret, name: str) -> PathLike | Gaussians | None:
+    """The plain model of a scene, which may be a model itself. Raises UsageError for two models."""
+    scene, model = given.scene, given.model
+    if not is_model(scene):
+        return model
+    if model is not None and model is not scene and path_of(model) != (path_of(scene) or ""):
+        argument = "cover_model" if name == "the cover" else "model"
+        what = "a source in memory" if isinstance(scene, Gaussians) else scene
+        raise UsageError(f"{what} is a model itself: leave out `{argument}`")
+    return scene
 
-    @property
-    def photos(self) -> list[bool]:
-        """For each scene, whether it has photos; others are models themselves."""
-        return [isinstance(scene, Scene) or not is_model(scene) for scene in self.scenes]
 
-    @property
-    def paths(self) -> list[Path]:
-        """All files and folders among the arguments."""
-        return [Path(source) for source in (*self.scenes, *self.models) if isinstance(source, str | Path)]
-
-    def read(self, views: ViewOptions) -> list[Source]:
-        """Read photos and models. Raises UsageError and InputError."""
-        places = list(map(self._model_of, range(len(self.scenes))))
-        names = ["the cover"] + ["the secret"] * len(self.keys)
-        # Reading large files takes seconds each, mostly without the GIL.
-        with ThreadPoolExecutor(_READERS) as readers:
-            models = readers.map(_read_visible, places, names)
-            sources = []
-            for scene, photos, key in zip(self.scenes, self.photos, ("", *self.keys), strict=True):
-                sources.append(Source(None, photos, key, as_scene(scene, views) if photos else None))
-            for index, model in enumerate(models):
-                place, loaded = places[index], sources[index].loaded
-                if model is not None and loaded is not None and place is not None:
-                    model = in_frame_of(loaded, loaded.to_scene_frame(model), place, self.scenes[index])
-                sources[index] = replace(sources[index], given=model)
-        return sources
-
-    def _model_of(self, index: int) -> PathLike | Gaussians | None:
-        """The plain model of a scene, which may be a model itself. Raises UsageError for two models."""
-        scene, model = self.scenes[index], self.models[index]
-        if isinstance(scene, Scene) or not is_model(scene):
-            return model
-        if model is not None and model is not scene and path_of(model) != (path_of(scene) or ""):
-            argument = "model" if index else "cover_model"
-            what = "a source in memory" if isinstance(scene, Gaussians) else scene
-            raise UsageError(f"{what} is a model itself: leave out `{argument}`")
-        return scene
-
-    def with_renders(self, sources: Sequence[Source], views: ViewOptions, *, train: bool) -> list[Source]:
-        """Render the images of scenes without photos; `train`: those of training views too."""
-        return [
-            source
-            if source.photos
-            else replace(source, loaded=as_scene(scene, views, train_pictures=train, model=source.given))
-            for scene, source in zip(self.scenes, sources, strict=True)
-        ]
-
-    def plain_steps(self, sources: Sequence[Source], fits: Sequence[FitConfig]) -> list[int | None]:
-        """Training steps of the plain models; None: a given model, unknown."""
-        return [
-            fit.iterations if source.given is None else _steps_of(model)
-            for source, model, fit in zip(sources, self.models, fits, strict=True)
-        ]
-
-    def models_to_write(self, sources: Sequence[Source]) -> dict[str, Gaussians]:
-        """Plain models by file name, without those that the user gave as files."""
-        return {
-            name: source.model
-            for name, source, scene in zip(plain_names(len(self.keys)), sources, self.scenes, strict=True)
-            if isinstance(scene, Scene | Gaussians) or source.photos
-        }
+def with_renders(
+    given: Sequence[Secret], sources: Sequence[Source], views: ViewOptions, *, train: bool
+) -> list[Source]:
+    """Render the images of scenes without photos; `train`: those of training views too."""
+    return [
+        source
+        if source.photos
+        else replace(source, loaded=as_scene(one.scene, views, train_pictures=train, model=source.given))
+        for one, source in zip(given, sources, strict=True)
+    ]
 
 
 def _steps_of(model: PathLike | Gaussians | None) -> int | None:

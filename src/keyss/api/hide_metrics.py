@@ -11,9 +11,8 @@ import torch
 from keyss.core.errors import KeyssWarning, QualityError
 from keyss.core.gaussians import Gaussians
 from keyss.fitting.image_metrics import quality
-from keyss.measure.hide_quality import BaselineQuality, Shown, compare, measure_hiding
+from keyss.measure.hide_quality import BaselineQuality, Shown, measure_without_keys
 from keyss.methods.method import Prepared, Source, Stego, Training
-from keyss.methods.plain_models import Bound
 from keyss.runs.run_records import HideMetrics
 
 _MIN_PSNR = 20.0  # dB to the plain model; below it, renders show something else
@@ -31,17 +30,15 @@ class PlainModel:
     gaussians: int
     sh_degree: int
     steps: int | None  # training steps; None: the model was given, unknown
-    bound: Bound  # the upper bound of its scene
+    total_steps: int | None  # with those of the method
+    is_bound: bool  # whether it is the upper bound
 
     @staticmethod
-    def of(source: Source, training: Training, steps: int | None) -> PlainModel:
-        return PlainModel(len(source.model), source.model.sh_degree, steps, Bound.of(training, steps))
-
-
-def compare_with(device: torch.device, source: Source, model: Gaussians) -> Shown:
-    """Compare a model with the test views of its scene, and with its plain model or renders of it."""
-    plain = source.given.to(device) if source.given is not None else None
-    return compare(model.to(device), plain, source.scene, of_plain=not source.photos)
+    def of(source: Source, training: Training) -> PlainModel:
+        size = len(source.model), source.model.sh_degree
+        return PlainModel(
+            *size, source.steps, training.total(source.steps), training.keeps_bound(source.steps)
+        )
 
 
 def check_quality(
@@ -106,16 +103,20 @@ def hide_metrics(
     """The content of `metrics.json`, without the time of the run."""
     scenes, seed = [source.scene for source in sources], prepared.options.fit.known_seed
     qualities, steps = [render.plain for render in shown], [before.steps for before in plain]
-    sizes, equal = [before.gaussians for before in plain], [before.bound.equal for before in plain]
+    sizes, equal = [before.gaussians for before in plain], [before.is_bound for before in plain]
     for index, model in longer.items():
         scene = scenes[index]
         qualities[index] = quality(model.to(device), scene.test, scene.background.to(device))
-        sizes[index], steps[index], equal[index] = len(model), plain[index].bound.steps, True
+        sizes[index], steps[index], equal[index] = len(model), plain[index].total_steps, True
     baseline = BaselineQuality(qualities[0], tuple(qualities[1:]), tuple(sizes), tuple(steps), tuple(equal))
-    measured = measure_hiding(stego.gaussians.to(device), stego.opened, scenes, shown, baseline, seed=seed)
+    wrong, chance = measure_without_keys(stego.gaussians.to(device), stego.opened, scenes, seed=seed)
     return HideMetrics(
-        **vars(measured),
         method=prepared.options.method,
+        cover=shown[0].quality,
+        secrets=tuple(render.quality for render in shown[1:]),
+        baseline=baseline,
+        wrong_key=wrong,
+        chance_level=chance,
         gaussians=len(stego.gaussians),
         photos=tuple(source.photos for source in sources),
         secret_gaussians=tuple(map(len, models[1:])),
@@ -123,7 +124,7 @@ def hide_metrics(
             (model.sh_degree, before.sh_degree) for model, before in zip(models[1:], plain[1:], strict=True)
         ),
         iterations=stego.iterations,
-        steps=tuple(before.bound.steps for before in plain),
+        steps=tuple(before.total_steps for before in plain),
         seconds=0.0,
         width=scenes[0].train[0].camera.width,
         seed=seed,

@@ -22,17 +22,12 @@ _VIEWS = 3
 _MAX_BYTES = 1 << 20
 
 
-class _Frame(msgspec.Struct):
-    """Nerfstudio's file: x -> scale * (transform @ (x, 1)), from the frame of the cameras to the model's."""
+class _Transforms(msgspec.Struct):
+    """Of Nerfstudio's files: x -> scale * (transform @ (x, 1)), from the cameras' frame to the model's."""
 
-    transform: list[list[float]]  # [3, 4]
-    scale: float
-
-
-class _Scene(msgspec.Struct):
-    """What a transforms.json says about its own frame."""
-
-    applied_transform: list[list[float]] | None = None  # [3, 4], from COLMAP's
+    transform: list[list[float]] = []  # [3, 4]
+    scale: float = 1.0
+    applied_transform: list[list[float]] | None = None  # [3, 4], of a transforms.json: from COLMAP's frame
 
 
 def in_frame_of(scene: Scene, model: Gaussians, source: PathLike | Gaussians, folder: object) -> Gaussians:
@@ -46,7 +41,7 @@ def in_frame_of(scene: Scene, model: Gaussians, source: PathLike | Gaussians, fo
     as_it_is, one_colour = mean_psnr(model, views, scene.background), _psnr_of_one_colour(views)
     if as_it_is >= one_colour or isinstance(source, Gaussians):
         return model
-    moved = [frame.apply_gaussians(model) for frame in _frames(Path(source), folder)]
+    moved = _moved(model, Path(source), folder)
     best = max(moved, key=lambda frame_model: mean_psnr(frame_model, views, scene.background), default=model)
     best_psnr = mean_psnr(best, views, scene.background)
     if best_psnr >= one_colour:
@@ -69,19 +64,19 @@ def _psnr_of_one_colour(views: tuple[View, ...]) -> float:
     return sum(psnr(one, photo) for one, photo in zip(flat, photos, strict=True)) / len(photos)
 
 
-def _frames(model: Path, folder: object) -> Iterator[Similarity]:
-    """From the model's frame to that of its cameras, which may be COLMAP's or that of a transforms.json."""
-    beside = model.with_name(_NERFSTUDIO)
+def _moved(model: Gaussians, path: Path, folder: object) -> Iterator[Gaussians]:
+    """`model` in the frame of its cameras, which may be COLMAP's or that of a transforms.json."""
+    beside = path.with_name(_NERFSTUDIO)
     if not beside.is_file():
         return
     try:
-        file = msgspec.json.decode(read_file(beside, _MAX_BYTES), type=_Frame)
-        from_cameras = _similarity(file.transform, file.scale)
-        yield from_cameras.inverse()
+        file = msgspec.json.decode(read_file(beside, _MAX_BYTES), type=_Transforms)
+        moved = _similarity(file.transform, file.scale).inverse().apply_gaussians(model)
+        yield moved
         if isinstance(folder, str | Path) and (scene := Path(folder) / "transforms.json").is_file():
-            applied = msgspec.json.decode(read_file(scene), type=_Scene).applied_transform
+            applied = msgspec.json.decode(read_file(scene), type=_Transforms).applied_transform
             if applied is not None:
-                yield _after(_similarity(applied, 1.0), from_cameras.inverse())
+                yield _similarity(applied, 1.0).apply_gaussians(moved)
     except (msgspec.MsgspecError, ValueError) as error:
         raise InputError(f"{beside}: expected Nerfstudio's transform and scale: {error}") from error
 
@@ -91,12 +86,3 @@ def _similarity(rows: list[list[float]], scale: float) -> Similarity:
     if matrix.shape != (3, 4):
         raise ValueError(f"expected 3 rows of 4 numbers, got {list(matrix.shape)}")
     return Similarity(scale, matrix[:, :3], scale * matrix[:, 3])
-
-
-def _after(second: Similarity, first: Similarity) -> Similarity:
-    """The transform that applies `first`, then `second`."""
-    return Similarity(
-        second.scale * first.scale,
-        second.rotation @ first.rotation,
-        second.apply_points(first.translation),
-    )

@@ -15,7 +15,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, ViewOptions, checked_background
 from keyss.files.atomic import check_not_an_input, check_output_file, write_bytes
 from keyss.files.images import animation_bytes, png_bytes
-from keyss.measure.hide_quality import WRONG_KEYS, compare, measure_hiding
+from keyss.measure.hide_quality import WRONG_KEYS, compare, measure_without_keys
 from keyss.measure.renders import renders_of
 from keyss.progress import Reporter, reporter as default_reporter
 from keyss.rendering import Backend, resolve_device
@@ -122,15 +122,16 @@ def evaluate(
             secrets=tuple(render.plain for render in shown[1:]),
             gaussians=tuple(None if model is None else len(model) for model in baselines),
         )
-        measured = measure_hiding(
-            stego,
-            opened.opened,
-            scenes,
-            shown,
-            baseline,
-            wrong_keys=tries,
-            seed=opened.metrics.seed,
+        wrong, chance = measure_without_keys(
+            stego, opened.opened, scenes, wrong_keys=tries, seed=opened.metrics.seed
         )
-    metrics = replace(opened.metrics, **vars(measured))
+    metrics = replace(
+        opened.metrics,
+        cover=shown[0].quality,
+        secrets=tuple(render.quality for render in shown[1:]),
+        baseline=baseline,
+        wrong_key=wrong,
+        chance_level=chance,
+    )
     write_again(opened.folder, "hide", METRICS, metrics)
     return metrics

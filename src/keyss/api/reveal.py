@@ -32,7 +32,7 @@ def reveal(
 
     The model determines the method. `frame`: "secret" gives a scene in its own frame, in which its cameras
     are valid; "cover" leaves it in the cover's, in which carried secrets have no position. `companion`: the
-    companion file of this secret, for methods without keys (`keyss.methods.companion`). Some of these methods
+    companion file of this secret, for methods without keys (`keyss.methods.hidden`). Some of these methods
     give a model that a network decodes (`keyss.core.picture_network`), which is no 3DGS model.
 
     `out` (a file) gets the secret: a scene in the format of the suffix (.ply, .spz, ...), or the bytes of a

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -110,23 +111,6 @@ class Training:
 PHOTOS, TRAINING = Photos(), Training()
 
 
-def changed_flags(options: Any) -> list[str]:
-    """Flags whose options, also in groups, differ from their defaults."""
-    flags = []
-    for field in fields(options):
-        value = getattr(options, field.name)
-        if is_dataclass(value):
-            flags += changed_flags(value)
-        elif value != field.default:
-            flags.append(flag(field.name))
-    return flags
-
-
-def flag(name: str) -> str:
-    """`--max-gaussians` for `max_gaussians`."""
-    return f"--{name.replace('_', '-')}"
-
-
 def check_exists(*paths: Path | None, keys: Sequence[Path] = ()) -> None:
     """Raise InputError if an input does not exist, UsageError if - is given twice. Does not import torch."""
     names = [str(path) for path in (*paths, *keys) if path is not None]
@@ -143,6 +127,14 @@ def check_seed(seed: int) -> int:
     if not 0 <= seed < 1 << 32:
         raise UsageError(f"--seed: expected 0 to {(1 << 32) - 1}, got {seed}")
     return seed
+
+
+def waiting_for(task: str, what: str, model: Path) -> AbstractContextManager[Any]:
+    """While the context is open, a line says `what` is done and how long the task takes for a model."""
+    from keyss.progress import waiting
+    from keyss.runs.estimates import seconds_for
+
+    return waiting(f"{what} {model.name}", seconds_for(task, model))
 
 
 def verb(name: str) -> Any:

@@ -17,9 +17,9 @@ GROUPS = {
         "keygen": "cli.make",
         "convert": "cli.make",
     },
-    "open": {"reveal": "cli.reveal_command", "verify": "cli.reveal_command"},
-    "look": {"view": "cli.show", "render": "cli.show", "info": "cli.show"},
-    "measure": {"evaluate": "cli.show", "audit": "lab.lab_commands"},
+    "open": {"reveal": "cli.open_and_show", "verify": "cli.open_and_show"},
+    "look": {"view": "cli.open_and_show", "render": "cli.open_and_show", "info": "cli.open_and_show"},
+    "measure": {"evaluate": "cli.open_and_show", "audit": "lab.lab_commands"},
     "many": dict.fromkeys(("compare", "reproduce", "sweep"), "lab.lab_commands"),
     "check": {"doctor": "cli.doctor"},
 }

@@ -11,9 +11,7 @@ import warnings
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import is_dataclass
-from itertools import pairwise
-from types import UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
 from keyss import __version__
 from keyss.core.errors import (
@@ -23,7 +21,7 @@ from keyss.core.errors import (
     KeyssWarning,
     OutputError,
     UsageError,
-    nearest,
+    did_you_mean,
     signal_of,
 )
 
@@ -32,11 +30,6 @@ OUT_OF_MEMORY = 8
 INTERNAL_ERROR = 70  # EX_SOFTWARE
 _LEVELS = {"-q": -1, "--quiet": -1, "-v": 1, "--verbose": 1}
 _KEY_OPTIONS = ("-k", "-p", "--key", "--keys", "--password", "--passphrase")  # options that people may expect
-# Options that take the place of --quick, and how.
-_QUICKER = {
-    "preset": "give --preset quick",
-    "only": "--only PART audits one part, and --dry-run prints the time of each",
-}
 # Arguments whose options have another name.
 _RENAMED = {"key": "key_file", "keys": "key_file", "secrets": "secret", "model": "secret_model"}
 
@@ -78,7 +71,6 @@ def _run(arguments: list[str], options: dict[str, Any]) -> None:
     import tyro
 
     from keyss.cli import command_table
-    from keyss.cli.arguments import flag
 
     if arguments in (["--help"], ["-h"]):
         print(command_table.help_page())
@@ -87,9 +79,7 @@ def _run(arguments: list[str], options: dict[str, Any]) -> None:
         _print_completion(rest)
         return
     if name not in command_table.MODULES:
-        near = nearest(name.lower(), command_table.MODULES)
-        hint = f"did you mean `keyss {near}`?" if near else "see `keyss --help`"
-        raise UsageError(f"there is no command {name!r}: {hint}")
+        raise UsageError(f"there is no command {name!r}: {did_you_mean(name.lower(), command_table.MODULES)}")
     if any(word.partition("=")[0] in _KEY_OPTIONS for word in rest):  # the parser would print its value
         raise UsageError(
             "a key cannot be an argument, which other users could see: give --key-file FILE, set KEYSS_KEY, "
@@ -97,23 +87,6 @@ def _run(arguments: list[str], options: dict[str, Any]) -> None:
         )
     command = command_table.parse_target(name, rest)
     options.update(options_of(command))
-    if "out" not in options and {"-o", "--out"} & {word.partition("=")[0] for word in rest}:
-        raise UsageError(
-            f"`keyss {name}` has no option -o: results go into the folder of the run, if any; see "
-            f"`keyss {name} --help`"
-        )
-    if "--quick" in rest and "quick" not in options:
-        for option, cure in _QUICKER.items():
-            if option in options:
-                raise UsageError(f"`keyss {name}` has no option --quick: {cure}")
-    for word, value in pairwise(rest):
-        choices = _choices(options.get(word.removeprefix("--").replace("-", "_")))
-        if choices and word.startswith("--") and value not in choices:
-            raise UsageError(f"{word}: expected one of {', '.join(choices)}, got {value!r}")
-    known = {"--help", *map(flag, options)}
-    for given in (word.partition("=")[0].replace("_", "-") for word in rest):
-        if given.startswith("--") and given not in known and (near := nearest(given, known)):
-            raise UsageError(f"`keyss {name}` has no option {given}: did you mean {near}?")
     tyro.cli(command, prog=f"keyss {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))
 
 
@@ -245,17 +218,6 @@ def as_flags(message: str, options: Collection[str]) -> str:
         return " ".join(words)
 
     return re.sub("`([^`]*)`", flags, message)
-
-
-def _choices(hint: Any) -> list[str]:
-    """The values of an option that has a few; empty for any other."""
-    if get_origin(hint) is Annotated:
-        return _choices(hint.__origin__)
-    if get_origin(hint) is Literal:
-        return [str(value) for value in get_args(hint)]
-    if get_origin(hint) in (Union, UnionType):
-        return [value for part in get_args(hint) for value in _choices(part)]
-    return []
 
 
 def options_of(command: Any) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, make_dataclass, replace
@@ -24,9 +23,7 @@ from keyss.cli.arguments import (
     PresetName,
     Resume,
     Training,
-    changed_flags,
     check_exists,
-    flag,
     optional,
     switch,
     verb,
@@ -143,28 +140,18 @@ def hide(args: HideArguments) -> None:
     details = args.details
     secrets = (*args.secret, *args.secret_file, *details.secret_model)
     check_exists(args.cover, details.cover_model, *secrets, keys=args.key_file)
-    options = _method_options(args)
     if args.secret_file:
         if args.secret:
             raise UsageError("--secret and --secret-file do not go together: hide scenes or files, not both")
-        used = "cover secret_file key_file publish format out overwrite device channel dry_run"
-        if unused := [name for name in changed_flags(args) if name not in map(flag, used.split())]:
-            raise UsageError(f"--secret-file does not use {unused[0]}: leave out {unused[0]}")
     elif not args.secret:
         raise UsageError("no secret: give --secret SCENE or --secret-file FILE, one for each secret")
     run = verb("hide")
     from keyss import progress
 
-    idle = "" if args.secret_file else _ignored_training_flags(args)
-    if idle and not options.may_train:
-        raise UsageError(
-            f"{idle}: nothing is trained, as models of all scenes are given and --method {options.method} "
-            "does not fine-tune them: leave out such options"
-        )
     result = run(
         args.cover,
         _secrets(args),
-        method=options,
+        method=_method_options(args),
         views=args.photos.views(),
         cover_model=details.cover_model,
         bound=details.bound,
@@ -176,24 +163,20 @@ def hide(args: HideArguments) -> None:
         dry_run=args.dry_run,
         reporter=progress.reporter(),
     )
-    trained = any(result.cost.steps) if result.cost else result.metrics and result.metrics.iterations
-    if idle and not trained:
-        print(
-            f"keyss: warning: {idle} had no effect: the secrets fit as they are, and nothing is trained",
-            file=sys.stderr,
-        )
     _print_result(args, result)
 
 
 def _print_result(args: HideArguments, result: HideResult) -> None:
     """Print measurements, files and what to do with them, or the plan of a dry run."""
     from keyss import progress
-    from keyss.cli.tables import print_files, print_hiding, print_plan
+    from keyss.cli.tables import print_cost, print_files, print_hiding
     from keyss.methods import registry
     from keyss.runs.files import COMPANIONS, LOOK, STEGOS
 
-    if result.plan is not None and result.cost is not None:
-        print_plan(args.method, result.plan, result.cost)
+    if (plan := result.plan) is not None and result.cost is not None:
+        size = f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, {plan.megabytes:,.1f} MB"
+        rows = [("method", args.method), ("capacity", plan.room), ("published", size)]
+        print_cost(result.cost, rows, plan.notes)
         return
     if result.psnr is not None:
         for file in args.secret_file:
@@ -206,12 +189,9 @@ def _print_result(args: HideArguments, result: HideResult) -> None:
     if result.metrics is not None and progress.level >= 0:
         print_hiding(result.metrics, brief=progress.level < 1)
     method = registry.get(args.method)
-    what = (
-        ": the cover with the secret in it" if method.capabilities.keys or method.options().may_train else ""
-    )
     published = [args.out / name for name in STEGOS if (args.out / name).exists()]
     size = f", {sum(path.stat().st_size for path in published) / 1e6:,.1f} MB"
-    files = dict.fromkeys(STEGOS, _HOW_TO_PUBLISH[result.survives] + what + size)
+    files = dict.fromkeys(STEGOS, _HOW_TO_PUBLISH[result.survives] + size)
     private = "the list of files that --overwrite may replace"
     if result.metrics is not None:
         private = "measurements, configuration, fitted models if any"
@@ -257,20 +237,10 @@ def _secrets(args: HideArguments) -> list[Secret] | list[SecretFile]:
     return list(map(Secret, args.secret, given, models or (None,) * count))
 
 
-def _ignored_training_flags(args: HideArguments) -> str:
-    """The given options that only affect training, if all scenes are models; otherwise empty."""
-    from keyss.rendering.orbit import is_model
-
-    sources = [args.details.cover_model or args.cover, *(args.details.secret_model or args.secret)]
-    if not all(map(is_model, sources)):
-        return ""
-    training = ("--preset", "--iterations", "--max-gaussians")
-    return " and ".join(flag for flag in changed_flags(args) if flag in training)
-
-
 def _method_options(args: HideArguments) -> MethodOptions:
     """The preset with the options of the command line."""
     from keyss.methods.registry import options_of
+    from keyss.rendering import resolve_device
 
     known = own_options(args.method)
     changes = {
@@ -280,18 +250,8 @@ def _method_options(args: HideArguments) -> MethodOptions:
     }
     changes |= {"publish": args.publish, "format": args.format}
     changes |= {"channel": args.details.channel} if args.details.channel else {}
-    options = replace(options_of(args.method).preset(args.preset, _kind_of_device(args)), **changes)
-    return options.with_fit(**args.training.schedule())
-
-
-def _kind_of_device(args: HideArguments) -> str:
-    """The device of the preset; where nothing is trained, without importing torch."""
-    if args.device != "auto" or not args.secret:
-        return "cuda" if args.device == "cuda" else "cpu"
-    verb("hide")  # imports torch
-    from keyss.rendering import resolve_device
-
-    return resolve_device(args.device).type
+    preset = options_of(args.method).preset(args.preset, resolve_device(args.device).type)
+    return replace(preset, **changes).with_fit(**args.training.schedule())
 
 
 def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
@@ -305,7 +265,10 @@ def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
     chooser.add_argument("--method", nargs="?")
     asked = chooser.parse_known_args(arguments)[0].method
     name = asked if asked in registry.METHODS else registry.DEFAULT
-    flags = {method: set(map(flag, own_options(method))) for method in registry.METHODS}
+    flags = {
+        method: {f"--{option.replace('_', '-')}" for option in own_options(method)}
+        for method in registry.METHODS
+    }
     for argument in arguments:
         given = argument.partition("=")[0].replace("_", "-")
         having = [method for method in flags if given in flags[method]]

@@ -36,7 +36,12 @@ def keys(files: Sequence[Path], count: int, *, new: bool = False) -> list[str]:
     else:
         chosen = [_prompt(f"Key {i + 1} of {count}" if count > 1 else "Key", new) for i in range(count)]
     if new:
-        warn_of_weak_keys(chosen)
+        from keyss.keys import weakness
+
+        for number, key in enumerate(chosen, start=1):
+            if problem := weakness(key):
+                which = f"key {number}: " if len(chosen) > 1 else ""
+                print(f"keyss: warning: {which}{problem}", file=sys.stderr)
     return chosen
 
 
@@ -61,16 +66,6 @@ def keys_of_run(run: Path, files: Sequence[Path]) -> list[str]:
         if not registry.get(method).capabilities.keys:
             return []
     return keys(files, len(files) or 1)
-
-
-def warn_of_weak_keys(chosen: Sequence[str]) -> None:
-    """Warn of keys that are easy to guess, without showing them."""
-    from keyss.keys import weakness
-
-    for number, key in enumerate(chosen, start=1):
-        if problem := weakness(key):
-            which = f"key {number}: " if len(chosen) > 1 else ""
-            print(f"keyss: warning: {which}{problem}", file=sys.stderr)
 
 
 def key_of_file(path: Path) -> str:

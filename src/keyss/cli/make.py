@@ -20,7 +20,6 @@ from keyss.cli.arguments import (
     Resume,
     Training,
     check_exists,
-    check_seed,
     optional,
     switch,
     verb,
@@ -49,11 +48,10 @@ def demo(
     from keyss.cli.tables import print_files, print_hiding
     from keyss.demo import WRONG_KEYS, run_demo
 
-    seed = check_seed(seed)
-    result = run_demo(out, seed=seed, device=device, overwrite=overwrite, reporter=progress.reporter())
+    metrics = run_demo(out, seed=seed, device=device, overwrite=overwrite, reporter=progress.reporter())
     if progress.level >= 0:
-        print_hiding(result.metrics)
-    progress.say(f"Wrong keys refused: {result.refused} of {len(WRONG_KEYS)}.")
+        print_hiding(metrics)
+    progress.say(f"Wrong keys refused: {len(WRONG_KEYS)}.")
     print_files(
         out,
         {

@@ -22,7 +22,6 @@ from keyss.runs.json_records import record_bytes
 if TYPE_CHECKING:
     from keyss.api.convert import Conversion
     from keyss.fitting.image_metrics import ImageQuality
-    from keyss.methods.method import Plan
     from keyss.runs.describe import InterruptedRun, ModelInfo, RunInfo, SceneInfo
     from keyss.runs.planning import Cost
     from keyss.runs.revealing import Verification
@@ -118,13 +117,6 @@ def _quality(of: ImageQuality) -> dict[str, str]:
     """Cells by the heads of their columns."""
     lpips = {} if of.lpips is None else {"LPIPS": f"{of.lpips:.3f}"}
     return {"PSNR": f"{of.psnr:.2f}", "SSIM": f"{of.ssim:.3f}"} | lpips
-
-
-def print_plan(method: str, plan: Plan, cost: Cost) -> None:
-    """Print capacity and estimates of a hiding."""
-    size = f"up to {plan.gaussians:,} Gaussians of SH degree {plan.sh_degree}, {plan.megabytes:,.1f} MB"
-    rows = [("method", method), ("capacity", plan.room), ("published", size)]
-    print_cost(cost, rows, plan.notes)
 
 
 def print_cost(cost: Cost, rows: Sequence[tuple[str, str]] = (), notes: Iterable[str] = ()) -> None:

@@ -9,6 +9,5 @@ from .run import (
     SECRET_PLY as SECRET_PLY,
     VIEWER as VIEWER,
     WRONG_KEYS as WRONG_KEYS,
-    DemoResult as DemoResult,
     run_demo as run_demo,
 )

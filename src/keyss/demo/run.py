@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
+
+import torch
 
 import keyss
 from keyss.core import Gaussians, Interrupted, Scene, WrongKeyError
-from keyss.core.arrays import Bytes
 from keyss.files import load_scene
 from keyss.files.atomic import public_mode
 from keyss.fitting import FitConfig, mean_psnr
-from keyss.measure.renders import contact_sheet
+from keyss.fitting.image_metrics import subsample_views
+from keyss.measure.renders import contact_sheet, renders_of
 from keyss.methods import CarryOptions
 from keyss.progress import Reporter, reporter as default_reporter
 from keyss.rendering import Backend, resolve_device
@@ -30,14 +33,6 @@ VIEWER = "index.html"
 _OPEN_SECONDS = 12.0  # to open the published files and compare their pictures
 
 
-@dataclass(frozen=True)
-class DemoResult:
-    """The measurements of the demo."""
-
-    metrics: HideMetrics  # content of metrics.json
-    refused: int  # number of wrong keys that opened nothing
-
-
 def run_demo(
     out: Path | str,
     *,
@@ -47,12 +42,13 @@ def run_demo(
     options: CarryOptions = OPTIONS,
     width: int | None = None,
     reporter: Reporter | None = None,
-) -> DemoResult:
+) -> HideMetrics:
     """Hide one scene in the other, open it, and write a comparison picture and a viewer page to `out`.
 
     `width`: pixels to which photos are shrunk. The key is `demo-key-SEED`, which is public. On the CPU, the
-    same seed gives the same `model.ply` and `secret.ply`. Raises KeyssError. On any exception, Ctrl-C
-    included, the demo removes everything it wrote.
+    same seed gives the same `model.ply` and `secret.ply`. Returns the content of `metrics.json`. Raises
+    KeyssError, and RuntimeError if a wrong key opens anything. On any exception, Ctrl-C included, the demo
+    removes everything it wrote.
     """
     out, reporter = Path(out), reporter or default_reporter()
     # Replaces all files of an earlier demo, those of other stages included.
@@ -79,17 +75,30 @@ def run_demo(
         results = RunFolder(out, "demo", onto=("scenes", "hide"))
         with results.work(), reporter.waiting("opening it again, with right and wrong keys", _OPEN_SECONDS):
             revealed = keyss.reveal(out / STEGO, key, device=device).gaussians
-            refused = sum(_is_refused(out / STEGO, wrong, device) for wrong in WRONG_KEYS)
+            for wrong in WRONG_KEYS:
+                with suppress(WrongKeyError):
+                    keyss.reveal(out / STEGO, wrong, device=device)
+                    raise RuntimeError(f"the wrong key {wrong!r} opens the published model")
             there = results.write({WEB: _hide_for_web(out, cover, secret, key, device)})
             converted = keyss.reveal(there / WEB, key, device=device).gaussians
-            comparison = _comparison(out, revealed, converted, cover, secret, metrics, device)
+            target = resolve_device(device)
+            carried = mean_psnr(converted.to(target), secret.test, secret.background.to(target))
+            shown = f"cover: published model\n{metrics.cover.psnr:.1f} dB"
+            columns = [
+                ("cover: photo", cover, None),
+                (shown, cover, keyss.read_model(out / STEGO)),
+                ("secret: photo", secret, None),
+                (f"opened with the key\n{metrics.secrets[0].psnr:.1f} dB", secret, revealed),
+                (f"opened from the .spz\n{carried:.1f} dB", secret, converted),
+            ]
+            comparison = _comparison(columns, target)
             look = look_of_scene(out / SCENES / COVER)
             viewer = page_with((out / STEGO).read_bytes(), Path(STEGO).name, look)
             files = {SECRET_PLY: revealed, COMPARISON: comparison, KEY: f"{key}\n".encode()}
             results.write(files | {VIEWER: viewer})
         for name in (VIEWER, WEB):  # pages contain published models
             (out / name).chmod(public_mode())
-        return DemoResult(metrics, refused)
+        return metrics
     except BaseException as error:
         clear(out)
         if isinstance(error, Interrupted):  # nothing is left to resume
@@ -113,45 +122,17 @@ def _hide_for_web(out: Path, cover: Scene, secret: Scene, key: str, device: Back
     return hidden.stego
 
 
-def _is_refused(stego: Path, key: str, device: Backend) -> bool:
-    try:
-        keyss.reveal(stego, key, device=device)
-    except WrongKeyError:
-        return True
-    return False
-
-
-def _comparison(
-    out: Path,
-    revealed: Gaussians,
-    converted: Gaussians,
-    cover: Scene,
-    secret: Scene,
-    metrics: HideMetrics,
-    device: Backend,
-) -> bytes:
-    """Photos and renders of three test views side by side."""
-    count = len(cover.test)
-    rows = sorted({count // 6, count // 2, count - 1 - count // 6})
-
-    def photos(scene: Scene) -> list[Bytes]:
-        return [scene.test[row].image.numpy() for row in rows]
-
-    def renders(model: Path | Gaussians, scene: Scene) -> list[Bytes]:
-        images = keyss.render(model, scene, device=device)
-        return [images[row][1].numpy() for row in rows]
-
-    target = resolve_device(device)
-    shown, opened = metrics.cover.psnr, metrics.secrets[0].psnr
-    carried = mean_psnr(converted.to(target), secret.test, secret.background.to(target))
-    columns = {
-        "cover: photo": photos(cover),
-        f"cover: published model\n{shown:.1f} dB": renders(out / STEGO, cover),
-        "secret: photo": photos(secret),
-        f"opened with the key\n{opened:.1f} dB": renders(revealed, secret),
-        f"opened from the .spz\n{carried:.1f} dB": renders(converted, secret),
-    }
-    pictures = zip(*columns.values(), strict=True)
+def _comparison(columns: Sequence[tuple[str, Scene, Gaussians | None]], device: torch.device) -> bytes:
+    """Photos, or renders of models, of three test views side by side."""
+    pictures = []
+    for _, scene, model in columns:
+        views = subsample_views(scene.test, 3)
+        if model is None:
+            pictures.append([view.image.numpy() for view in views])
+        else:
+            renders = renders_of(model.to(device), [view.camera for view in views], scene.background)
+            pictures.append([image.numpy() for _, image in renders])
+    rows = zip(*pictures, strict=True)
     return contact_sheet(
-        list(columns), {f"view {row}": images for row, images in zip(rows, pictures, strict=True)}
+        [head for head, _, _ in columns], {f"view {row}": images for row, images in enumerate(rows, 1)}
     )

@@ -309,13 +309,12 @@ def _points_txt(path: Path) -> PointCloud:
     ids, xyz, rgb = array("Q"), array("d"), array("B")  # lists take five times as much memory
     for where, words in _rows(path, "POINT3D_ID X Y Z R G B ERROR TRACK..."):
         color = [_number(int, where, word) for word in words[4:7]]
-        if not all(0 <= c <= 255 for c in color):
-            raise InputError(f"{where}: expected colours of 0 to 255, found {color}")
-        if not 0 <= (number := _number(int, where, words[0])) < 1 << 64:
-            raise InputError(f"{where}: expected the id of a point, found {words[0][:40]}")
-        ids.append(number)
         xyz.extend(_floats(where, words[1:4], 3))
-        rgb.extend(color)
+        try:
+            ids.append(_number(int, where, words[0]))
+            rgb.extend(color)
+        except OverflowError as error:
+            raise InputError(f"{where}: expected an id, and colours of 0 to 255, found {color}") from error
     values = np.array(xyz).reshape(-1, 3), np.array(rgb).reshape(-1, 3)
     return _sorted_points(path, np.array(ids), *values)
 

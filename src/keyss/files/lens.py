@@ -43,23 +43,17 @@ class Lens:
         """[3, 3] pixels."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
 
-    def is_integer_downscale(self, width: int, height: int) -> bool:
-        """True if the image size is the lens's divided by an integer, each side rounded up or down."""
-        factor = max(1, round(self.width / width))
-        return abs(width * factor - self.width) < factor and abs(height * factor - self.height) < factor
-
     def scale_to(self, width: int, height: int) -> Lens | None:
         """The lens scaled to an image of the same aspect, to within a pixel; None for another aspect.
 
-        Photos are often downscaled (`images_4`) after calibration.
+        Photos are often downscaled (`images_4`) after calibration, each side rounded up or down.
         """
         if (width, height) == (self.width, self.height):
             return self
-        fits = self.is_integer_downscale(width, height) or (
-            abs(self.height * width / self.width - height) < 1
-            or abs(self.width * height / self.height - width) < 1
-        )
-        if not fits:
+        factor = max(1, round(self.width / width))
+        divided = abs(width * factor - self.width) < factor and abs(height * factor - self.height) < factor
+        off = self.height * width / self.width - height, self.width * height / self.height - width
+        if not divided and min(map(abs, off)) >= 1:
             return None
         x, y = width / self.width, height / self.height
         return replace(

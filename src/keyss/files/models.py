@@ -79,21 +79,15 @@ def read_model(path: Path | str) -> Gaussians:
         return _read(file, path.name)
 
 
-def reads_as(path: Path, model: Gaussians) -> bool:
+def reads_as(path: Path | str, model: Gaussians, data: bytes | None = None) -> bool:
     """True if `read_model` gives `model`, to the bit, for a .ply; takes no memory for a second model.
 
-    Raises InputError as `read_model` does.
+    `data`: the content of the file, if it is not written yet. Raises InputError as `read_model` does.
     """
     if type(model) is not Gaussians or _for_writing(path) is not PLY:
         return False
-    with open_input(path) as file:
+    with open_input(Path(path)) if data is None else io.BytesIO(data) as file:
         return ply.holds(file, model)
-
-
-def holds(path: Path | str, data: bytes, model: Gaussians) -> bool:
-    """`reads_as` for a file at `path` that contains `data`."""
-    is_plain_model = type(model) is Gaussians and _for_writing(path) is PLY
-    return is_plain_model and ply.holds(io.BytesIO(data), model)
 
 
 def model_of_bytes(path: Path | str, data: bytes) -> Gaussians:
@@ -154,15 +148,10 @@ def _for_writing(path: Path | str) -> ModelFormat:
 
 def _write(file: BinaryIO, path: Path | str, model: Gaussians) -> None:
     model_format = _for_writing(path)
-    if isinstance(model, DecodedGaussians) and model_format is not DECODED:
+    if isinstance(model, DecodedGaussians) != (model_format is DECODED):
         raise UsageError(
-            f"cannot write {path}: a network decodes what this model renders, which 3DGS files cannot hold; "
-            f"use a name that ends in {DECODED_SUFFIX}, which `keyss render` reads"
-        )
-    if model_format is DECODED and not isinstance(model, DecodedGaussians):
-        raise UsageError(
-            f"cannot write a 3DGS model as {path}: {DECODED_SUFFIX} is for models that a network decodes; "
-            "use a name that ends in .ply"
+            f"cannot write {path}: {DECODED_SUFFIX}, which `keyss render` reads, is for models which a "
+            "network decodes; all others have other names, such as .ply"
         )
     try:
         if model_format is PLY:

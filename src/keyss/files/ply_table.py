@@ -1,4 +1,4 @@
-"""Elements of PLY files as structured arrays, and the Gaussians of 3DGS models among them.
+"""Elements of PLY files as structured arrays, and the Gaussians of 3DGS models among them, without torch.
 
 The reader is our own because the usual library, plyfile, is GPL, and because input is untrusted: lengths are
 checked against the file size before anything is allocated, and every defect raises InputError.
@@ -6,11 +6,13 @@ checked against the file size before anything is allocated, and every defect rai
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
@@ -18,6 +20,7 @@ import numpy.typing as npt
 
 from keyss.core.arrays import Floats, Numbers
 from keyss.core.errors import InputError, KeyssWarning, not_whole
+from keyss.files.inputs import open_input
 
 _MAX_HEADER_BYTES = 64 * 1024
 _CHUNK_BYTES, _TEXT_BYTES = 1 << 20, 1 << 16
@@ -37,7 +40,8 @@ _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": 
 # not help, since the float32 sigmoid rounds to exactly 1 from 16.64 on.
 OPACITY_LOGIT_BOUND = 16.0
 LEAST_LOG_SCALE = -87.33654  # log of the smallest normal float32; replaces minus infinity
-SAMPLE = 100  # Gaussians from which on `check_not_activated` judges, and about as many that it looks at
+NEARLY_TRANSPARENT = math.log(0.05 / 0.95)  # opacity logit
+_SAMPLE = 100  # Gaussians from which on `check_not_activated` judges, and about as many that it looks at
 _NEARLY_ALL = 0.99  # share of the scales
 # Values that are all positive are scales, not their logarithms, if half of them are below _SMALL_SCALE, if as
 # logarithms they made half of the Gaussians larger than _LARGE of the model, or if they vary by _RATIO.
@@ -316,9 +320,9 @@ def check_not_activated(means: Floats, log_scales: Floats, opacity_logits: Float
     Logits of trained models are not all within 0 to 1. Logarithms of scales are all positive in large units
     only, where they are much alike.
     """
-    if len(means) < SAMPLE:
+    if len(means) < _SAMPLE:
         return
-    means, log_scales = means[:: len(means) // SAMPLE], log_scales[:: len(means) // SAMPLE]
+    means, log_scales = means[:: len(means) // _SAMPLE], log_scales[:: len(means) // _SAMPLE]
     spread = np.median(np.abs(means - np.median(means, axis=0)).max(axis=1))
     least, middle, most = np.quantile(log_scales, [0.05, 0.5, 0.95])
     large = middle < _SMALL_SCALE or np.exp(min(middle, 80.0)) > _LARGE * spread or most > _RATIO * least
@@ -368,3 +372,43 @@ def model_names(k: int) -> list[str]:
     colors = [*(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(3 * (k - 1)))]
     shape = [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     return ["x", "y", "z", *colors, "opacity", *shape]
+
+
+@dataclass(frozen=True)
+class PlySummary:
+    """The size of a model, and statistics of its Gaussians, which need no model in memory."""
+
+    gaussians: int
+    sh_degree: int
+    low: Floats  # [3] corner of the bounding box, like `high`
+    high: Floats
+    nearly_transparent: int  # Gaussians with opacities below 0.05
+
+
+def summarise_ply(path: Path) -> PlySummary | None:
+    """The summary of a .ply, None for any other file; raises as `read_model` does."""
+    if not path.is_file() or not path.name.lower().endswith(".ply"):
+        return None
+    with open_input(path) as file:
+        if file.read(3) != b"ply":
+            return None
+        file.seek(0)
+        return _summary(file) if is_plain(file) else None
+
+
+def _summary(file: BinaryIO) -> PlySummary:
+    vertices, names, blocks = read_rows(file, ("x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2"))
+    step = max(1, vertices.count // _SAMPLE)
+    low, high = np.full(7, np.inf, np.float32), np.full(7, -np.inf, np.float32)
+    count, transparent, sample = 0, 0, []
+    for rows, _ in blocks:
+        if not len(rows):
+            continue
+        low, high = np.minimum(low, rows.min(axis=0)), np.maximum(high, rows.max(axis=0))
+        transparent += int((rows[:, 3] < NEARLY_TRANSPARENT).sum())
+        sample.append(rows[-count % step :: step].copy())
+        count += len(rows)
+    sampled = np.concatenate(sample)
+    check_not_activated(sampled[:, :3], sampled[:, 4:], np.stack([low, high])[:, 3])
+    degree = math.isqrt((len(names) - 11) // 3) - 1
+    return PlySummary(count, degree, low[:3], high[:3], transparent)

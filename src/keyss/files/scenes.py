@@ -99,7 +99,7 @@ def load_scene(
             damaged.append(photo.name)
     sizes = [(width, height) for _, (width, height, _) in probed]
     _check_memory(folder, sizes, width)
-    photos = _fit_lenses(folder, [photo for photo, _ in probed], sizes)
+    photos = [_fit_lens(photo, size) for (photo, _), size in zip(probed, sizes, strict=True)]
     transparent = any(transparent for _, (*_, transparent) in probed)
     under = torch.ones(3) if behind is None else behind  # transparent pixels
     # Most scenes have one lens, and a map is as large as a photo.
@@ -214,34 +214,18 @@ def read_layout(folder: Path, skip_missing: bool) -> SceneLayout:
     raise InputError(f"{folder}: expected a scene, found {listing}. Known layouts: {_KNOWN}")
 
 
-def _fit_lenses(folder: Path, photos: Sequence[Photo], sizes: Sequence[tuple[int, int]]) -> list[Photo]:
-    """The photos with lenses scaled to their image `sizes` (width, height).
-
-    Raises InputError for another aspect. Warns (KeyssWarning) of images that are no integer downscale.
-    """
-    fitted, scaled = [], []
-    for photo, size in zip(photos, sizes, strict=True):
-        lens = photo.lens.scale_to(*size)
-        pair = f"{photo.lens.width}x{photo.lens.height}", f"{size[0]}x{size[1]}"
-        if lens is None:
-            advice = "resize it instead of cropping it, or compute the cameras from the photos as they are"
-            if is_rotated_by_exif(photo.path):
-                advice = "its EXIF orientation rotates it: rotate its pixels"
-            raise InputError(
-                f"{photo.path}: expected the size of its camera, {pair[0]}, or another of that aspect, found "
-                f"{pair[1]}; {advice}"
-            )
-        if not photo.lens.is_integer_downscale(*size):
-            scaled.append(f"{photo.name} has {pair[1]} pixels, its camera {pair[0]}")
-        fitted.append(replace(photo, lens=lens))
-    if scaled:
-        warnings.warn(
-            f"{folder}: the intrinsics of {len(scaled):,} of {len(photos):,} photos are scaled to their "
-            f"size: {scaled[0]}",
-            KeyssWarning,
-            stacklevel=3,
+def _fit_lens(photo: Photo, size: tuple[int, int]) -> Photo:
+    """The photo with its lens scaled to its image (width, height). Raises InputError for another aspect."""
+    lens = photo.lens.scale_to(*size)
+    if lens is None:
+        advice = "resize it instead of cropping it, or compute the cameras from the photos as they are"
+        if is_rotated_by_exif(photo.path):
+            advice = "its EXIF orientation rotates it: rotate its pixels"
+        raise InputError(
+            f"{photo.path}: expected the size of its camera, {photo.lens.width}x{photo.lens.height}, or "
+            f"another of that aspect, found {size[0]}x{size[1]}; {advice}"
         )
-    return fitted
+    return replace(photo, lens=lens)
 
 
 def _load_view(

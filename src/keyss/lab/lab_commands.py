@@ -12,7 +12,6 @@ from keyss.cli.arguments import (
     KeyFiles,
     OutFolder,
     Overwrite,
-    Resume,
     Run,
     Width,
     check_exists,
@@ -50,17 +49,15 @@ def audit(
             "all",
         ),
     ] = (),
-    dry_run: Annotated[bool, switch("Print estimates of the time of each part; needs no keys.")] = False,
-    resume: Resume = False,
     overwrite: Overwrite = False,
     device: Device = "auto",
     seed: Annotated[int, arg(metavar="N", help="Seed of all random numbers.")] = 0,
 ) -> None:
     """Audit a run: quality, stealth, attacks, robustness and speed; takes minutes.
 
-    example: keyss audit runs/hidden --key-file key.txt
+    Run the same command again to resume.
 
-    example: keyss audit runs/hidden --dry-run
+    example: keyss audit runs/hidden --key-file key.txt
 
     example: keyss audit runs/hidden --key-file key.txt --only stealth --only leaks
     """
@@ -69,23 +66,6 @@ def audit(
     from keyss import progress
     from keyss.cli.keys import keys_of_run
     from keyss.cli.tables import Console, print_columns, print_files, print_table
-
-    if dry_run:
-        from keyss.lab.audits.audit_run import forecast_audit
-        from keyss.runs.estimates import seconds_for
-        from keyss.runs.files import stego_in
-
-        with progress.waiting("reading the scenes", seconds_for("prepare", stego_in(run))):
-            seconds = forecast_audit(run, controls=controls, only=only, seed=seed, device=device)
-        print_table(
-            ("part", "time, about"), [(name, progress.about(duration)) for name, duration in seconds.items()]
-        )
-        print(
-            f"About {progress.about(sum(seconds.values()))}; controls are plain models of the cover, for "
-            "comparison; they are fitted once."
-        )
-        print("Dry run: nothing was written. Times are rough.")
-        return
     from keyss.lab.audits import headline
 
     result = measure(
@@ -96,7 +76,6 @@ def audit(
         seed=check_seed(seed),
         device=device,
         overwrite=overwrite,
-        resume=resume,
         reporter=progress.reporter(),
     )
     if progress.level >= 0:
@@ -311,7 +290,7 @@ def sweep(
     failed = [outcome for outcome in outcomes if outcome.error]
     progress.say(f"{len(outcomes) - len(failed)} of {len(outcomes)} trials are done")
     for outcome in failed:
-        print(f"failed: {outcome.name}: {outcome.error}")
+        print(f"failed: {outcome.trial.name}: {outcome.error}")
     if failed:
         raise InputError(f"{len(failed)} of {len(outcomes)} trials failed")
 

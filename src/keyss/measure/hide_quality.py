@@ -72,43 +72,39 @@ class Shown:
     fidelity: RenderFidelity | None
 
 
-@dataclass(frozen=True)
-class HidingQuality:
-    """Cover and secrets on their test views, beside plain models, wrong keys and chance."""
-
-    cover: ImageQuality
-    secrets: tuple[ImageQuality, ...]
-    baseline: BaselineQuality
-    wrong_key: WrongKeys | None  # None for methods without a keyed decoder
-    chance_level: tuple[float, ...]  # dB, the stego model itself against each secret's test views
-
-
-def measure_hiding(
+@torch.no_grad()
+def measure_without_keys(
     stego: Gaussians,
     opened: Sequence[HiddenScene],
     scenes: Sequence[Scene],  # the cover, then the secrets in the order of `opened`, each in its own frame
-    shown: Sequence[Shown],  # result of `compare`: the stego model, then the secrets
-    baseline: BaselineQuality,
     *,
     wrong_keys: int = WRONG_KEYS,
     seed: int,
-) -> HidingQuality:
-    """Collect the quality of cover and secrets, and measure renders under wrong keys.
+) -> tuple[WrongKeys | None, tuple[float, ...]]:
+    """Measure what wrong keys show, and chance: PSNRs in dB of the stego model on each secret's test views.
 
     Wrong keys are embeddings sampled like those of random keys. An attacker with a decoder but no key sees
-    the models they decode to, which should look like the cover: PSNRs at the chance level. Raises UsageError
-    if `wrong_keys` is less than 1.
+    the models they decode to, which should look like the cover: PSNRs at the chance level. None without a
+    decoder. Raises UsageError if `wrong_keys` is less than 1.
     """
     if wrong_keys < 1:
         raise UsageError(f"expected at least one wrong key, got {wrong_keys}")
     placed = [in_cover(*pair, scenes[0]) for pair in zip(opened, scenes[1:], strict=True)]
-    return HidingQuality(
-        cover=shown[0].quality,
-        secrets=tuple(render.quality for render in shown[1:]),
-        baseline=baseline,
-        wrong_key=_wrong_keys(stego, opened, scenes[0], placed, wrong_keys, seed),
-        chance_level=tuple(_psnr(stego, scene) for scene in placed),
-    )
+    chance = tuple(_psnr(stego, scene) for scene in placed)
+    vs_cover, vs_secrets = [], []
+    for secret, scene in zip(opened, placed, strict=True):
+        if secret.decode is None:
+            continue
+        embeddings = random_embeddings(wrong_keys, torch.Generator().manual_seed(seed), secret.key_size)
+        # One model at a time: they are large.
+        models = (secret.decode(stego, embedding) for embedding in embeddings)
+        pairs = [(_psnr(model, scenes[0]), _psnr(model, scene)) for model in models]
+        vs_cover.append([of_cover for of_cover, _ in pairs])
+        vs_secrets.append(_range([of_secret for _, of_secret in pairs]))
+    if not vs_cover:
+        return None, chance
+    means = [fmean(psnrs) for psnrs in zip(*vs_cover, strict=True)]
+    return WrongKeys(wrong_keys, _range(means), tuple(vs_secrets)), chance
 
 
 def in_cover(opened: HiddenScene, secret: Scene, cover: Scene) -> Scene:
@@ -124,35 +120,6 @@ def in_cover(opened: HiddenScene, secret: Scene, cover: Scene) -> Scene:
 
 
 @torch.no_grad()
-def _wrong_keys(
-    stego: Gaussians,
-    opened: Sequence[HiddenScene],
-    cover: Scene,
-    secrets: Sequence[Scene],  # placed in the cover's frame
-    count: int,
-    seed: int,
-) -> WrongKeys | None:
-    """PSNRs of decoded models under wrong embeddings; None without decoders."""
-    vs_cover, vs_secrets = [], []
-    for secret, scene in zip(opened, secrets, strict=True):
-        if secret.decode is None:
-            continue
-        embeddings = random_embeddings(count, torch.Generator().manual_seed(seed), secret.key_size)
-        models = (
-            secret.decode(stego, embedding) for embedding in embeddings
-        )  # one at a time: they are large
-        of_cover, of_secret = zip(
-            *((_psnr(model, cover), _psnr(model, scene)) for model in models), strict=True
-        )
-        vs_cover.append(of_cover)
-        vs_secrets.append(_range(of_secret))
-    if not vs_cover:
-        return None
-    means = [fmean(psnrs) for psnrs in zip(*vs_cover, strict=True)]
-    return WrongKeys(count, _range(means), tuple(vs_secrets))
-
-
-@torch.no_grad()
 def compare(model: Gaussians, plain: Gaussians | None, scene: Scene, *, of_plain: bool = False) -> Shown:
     """Compare both models with the test views of their scene, rendering each view once.
 
@@ -160,6 +127,7 @@ def compare(model: Gaussians, plain: Gaussians | None, scene: Scene, *, of_plain
     images are renders of the plain model, which is then not needed.
     """
     background = scene.background.to(model.device)
+    plain = None if plain is None else plain.to(model.device)
     compared = set(map(id, subsample_views(scene.test, _FIDELITY_VIEWS)))
     qualities: list[ImageQuality] = []
     plains: list[ImageQuality] = []

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import io
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import torch
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from keyss.core import Camera, Gaussians, Scene, View
+from keyss.core import Camera, Gaussians, View
 from keyss.core.arrays import Bytes
 from keyss.files.images import png_names
 from keyss.fitting.image_metrics import subsample_views
+from keyss.methods.method import Source, role_of
 from keyss.rendering import render
+from keyss.rendering.orbit import from_above
 
 
 def select_views(views: Sequence[View]) -> list[View]:
@@ -33,14 +35,16 @@ def renders_of(model: Gaussians, cameras: Sequence[Camera], background: Tensor) 
     return renders
 
 
-def sheet_of(columns: Sequence[tuple[str, str, Scene, Gaussians]]) -> bytes:
-    """A PNG of three test views: images and renders, by role, kind of the images, scene and model."""
+def sheet_of(models: Sequence[Gaussians], sources: Sequence[Source]) -> bytes:
+    """A PNG of three test views of cover and secrets: images, and renders of the models after hiding."""
     heads: list[str] = []
     pictures: list[list[Bytes]] = []
-    for role, kind, scene, model in columns:
+    for index, (model, source) in enumerate(zip(models, sources, strict=True)):
+        role, kind = role_of(index, len(sources)), "photo" if source.photos else "given model"
+        scene = source.scene if source.photos else from_above(source.scene)
         shown = subsample_views(scene.test, 3)
         renders = renders_of(model, [view.camera for view in shown], scene.background)
-        heads += [f"{role}, {kind}", f"{role}, {'published' if not heads else 'revealed'}"]
+        heads += [f"{role}, {kind}", f"{role}, {'revealed' if index else 'published'}"]
         pictures += [[view.image.numpy() for view in shown], [image.numpy() for _, image in renders]]
     count = min(map(len, pictures))
     rows = {f"view {row + 1}": [column[row] for column in pictures] for row in range(count)}
@@ -62,14 +66,16 @@ def contact_sheet(heads: Sequence[str], rows: Mapping[str, Sequence[Bytes]], cel
         for pictures in rows.values()
     ]
     left = math.ceil(max(map(font.getlength, rows))) + 2 * gap
-    widths = [
-        max(
-            *(math.ceil(font.getlength(word)) for word in head.split()),
-            *(picture.width for picture in pictures),
-        )
-        for head, pictures in zip(heads, zip(*scaled, strict=True), strict=True)
-    ]
-    wrapped = [_wrapped(head, width, font) for head, width in zip(heads, widths, strict=True)]
+    letter, wrapped, widths = font.getlength("n"), [], []
+    for head, column in zip(heads, zip(*scaled, strict=True), strict=True):
+        width = max(picture.width for picture in column)
+        lines = [
+            line
+            for part in head.split("\n")
+            for line in textwrap.wrap(part, max(1, int(width / letter)), break_long_words=False)
+        ]
+        wrapped.append("\n".join(lines))
+        widths.append(max(width, *(math.ceil(font.getlength(line)) for line in lines)))
     places = [left + sum(widths[:column]) + gap * column for column in range(len(heads))]
     top = gap + (1 + max(head.count("\n") for head in wrapped)) * (cell // 8)
     size = (left + sum(widths) + gap * len(heads), top + (cell + gap) * len(rows))
@@ -85,18 +91,3 @@ def contact_sheet(heads: Sequence[str], rows: Mapping[str, Sequence[Bytes]], cel
     file = io.BytesIO()
     sheet.save(file, "PNG", optimize=True)
     return file.getvalue()
-
-
-def _wrapped(text: str, width: int, font: Any) -> str:
-    """`text` with line breaks between words, so that lines are at most `width` pixels wide."""
-    lines = []
-    for paragraph in text.split("\n"):
-        line = ""
-        for word in paragraph.split():
-            longer = f"{line} {word}".strip()
-            if line and font.getlength(longer) > width:
-                lines.append(line)
-                longer = word
-            line = longer
-        lines.append(line)
-    return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""Hidden scenes and hidden files, which keys open."""
+"""Hidden scenes and hidden files, which keys open, and companion files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal
 
 from torch import Tensor
 
-from keyss.channels import Payload
+from keyss.channels import Payload, pack_payload, unpack_payload
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
@@ -18,6 +18,9 @@ Frame = Literal["secret", "cover"]
 
 FILE = "file"  # method name in the payload of a file
 MAX_NAME_BYTES = 255
+COMPANION = ".keyss"  # suffix of a companion file
+MAX_COMPANION_BYTES = 1 << 30
+_MAGIC = b"keyss handed 3\0\0"
 
 
 @dataclass(frozen=True)
@@ -97,3 +100,19 @@ class HiddenFile:
         if not payload.data or len(name) < size:
             raise InputError("the hidden file is damaged: its name is cut off")
         return HiddenFile(name.decode(errors="replace"), data, payload.shards)
+
+
+def pack_companion(payload: Payload) -> bytes:
+    """The bytes of a companion file: with it, the published model shows a secret without a key.
+
+    Methods that do not store a whole secret in the published model write one per secret: 16 bytes of magic,
+    then the payload.
+    """
+    return _MAGIC + pack_payload(payload)
+
+
+def unpack_companion(data: bytes) -> Payload:
+    """Invert `pack_companion`. Raises InputError."""
+    if not data.startswith(_MAGIC):
+        raise InputError("expected a `.keyss` file, as `keyss hide` writes for some methods")
+    return unpack_payload(data[len(_MAGIC) :])

@@ -42,6 +42,7 @@ class Source:
     photos: bool  # False: renders of the model replace photos
     key: str = field(default="", repr=False)  # the secret's key, if the method has keys
     loaded: Scene | None = None
+    steps: int | None = None  # training steps of the plain model, if known
 
     @property
     def scene(self) -> Scene:
@@ -65,6 +66,16 @@ class Training:
     steps: int = 0  # steps that render the scene
     continues: bool = True  # starts from the plain model, whose steps count too
     step_cost: float = 1.0  # time of a step over that of plain 3DGS
+
+    def total(self, plain_steps: int | None) -> int | None:
+        """All steps of the scene, those of its plain model included if they count; None: unknown."""
+        if not self.continues:
+            return self.steps
+        return None if plain_steps is None else plain_steps + self.steps
+
+    def keeps_bound(self, plain_steps: int | None) -> bool:
+        """True if the plain model has as many steps, and is the upper bound itself."""
+        return not self.steps if self.continues else self.steps == plain_steps
 
 
 @dataclass(frozen=True)
@@ -106,7 +117,6 @@ class Capabilities:
 
     keys: bool = True  # a key opens each secret; else a companion file of the model shows it
     standard: bool = True  # the published model is a 3DGS model, which every viewer renders
-    models: bool = True  # revealed secrets are 3DGS models; else a network renders their images
 
 
 @dataclass(frozen=True)
@@ -171,11 +181,6 @@ class MethodOptions:
                 raise UsageError(f"{refusal}; {cure} has room for {room:,} bytes") from refusal
             warnings.warn(_FALLBACK.format(refusal), KeyssWarning, stacklevel=2)
         return use(APPENDED)
-
-    @property
-    def may_train(self) -> bool:
-        """True if hiding may train even if models of all scenes are given."""
-        return any(training.steps for training in self.training(2))
 
     def fits(self, scenes: int) -> list[FitConfig]:
         """The fits of the plain models of `scenes`, the cover first."""

@@ -116,10 +116,10 @@ def open_model(stego: Gaussians, key: str) -> HiddenScene:
 
 
 def open_companion(data: bytes) -> HiddenScene:
-    """The secret in a companion file (see `keyss.methods.companion`). Raises InputError."""
-    from keyss.methods import companion
+    """The secret in a companion file. Raises InputError."""
+    from keyss.methods.hidden import unpack_companion
 
-    return _scene_of(companion.unpack(data))
+    return _scene_of(unpack_companion(data))
 
 
 def _scene_of(payload: Payload) -> HiddenScene:

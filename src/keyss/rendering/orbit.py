@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypeGuard
 
 import numpy as np
 import torch
@@ -32,9 +33,9 @@ TEST_EVERY, _LARGE = 12, 500_000  # views; minimum Gaussians of a model with slo
 _ORBIT_VIEWS, _SCENE_VIEWS, _SIZE = 4, 8, 256  # views and pixels for comparing models
 
 
-def is_model(source: str | Path | Gaussians) -> bool:
-    """True if a source is a model or a model's path, not a folder of photos."""
-    return isinstance(source, Gaussians) or is_model_source(source)
+def is_model(source: str | Path | Scene | Gaussians) -> TypeGuard[str | Path | Gaussians]:
+    """True if a source is a model or a model's path, not photos."""
+    return isinstance(source, Gaussians) or (not isinstance(source, Scene) and is_model_source(source))
 
 
 @torch.no_grad()

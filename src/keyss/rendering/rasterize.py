@@ -43,19 +43,41 @@ def render_with_meta(
     if sh_degree is None:
         sh_degree = gaussians.sh_degree
     if not isinstance(gaussians, DecodedGaussians):
-        return _render(gaussians, gaussians.sh, camera, background, sh_degree)
+        return render_features(gaussians, gaussians.sh, camera, background, sh_degree)
     network, colors = gaussians.network, gaussians.sh
     if gaussians.features is not None:
         colors, sh_degree = gaussians.features, None
-    image, meta = _render(gaussians, colors, camera, network.background, sh_degree)
+    image, meta = render_features(gaussians, colors, camera, network.background, sh_degree)
     return decode_picture(image, network), meta
 
 
 def render_features(
-    gaussians: Gaussians, features: Tensor, camera: Camera, background: Tensor | None = None
+    gaussians: Gaussians,
+    features: Tensor,
+    camera: Camera,
+    background: Tensor | None = None,
+    sh_degree: int | None = None,
 ) -> tuple[Tensor, dict[str, Any]]:
-    """`render_with_meta` with `features` [N, C] instead of colours; the image is [H, W, C]."""
-    return _render(gaussians, features, camera, background, None)
+    """`render_with_meta` with `features` [N, C] instead of colours, or harmonics up to `sh_degree`.
+
+    The image is [H, W, C].
+    """
+    device = gaussians.device
+    image, alpha, meta = rasterization(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        features,
+        camera.viewmat.to(device),
+        camera.K.to(device),
+        camera.width,
+        camera.height,
+        near_plane=camera.near,
+        sh_degree=sh_degree,
+        background=None if background is None else background.to(device),
+    )
+    return image, meta | {"alpha": alpha}
 
 
 def decode_picture(features: Tensor, network: PictureNetwork) -> Tensor:
@@ -77,27 +99,6 @@ def contributions(gaussians: Gaussians, cameras: Sequence[Camera]) -> Tensor:
         image, _ = render_features(model, grey, camera)
         total += torch.autograd.grad(image.sum(), grey)[0][:, 0]
     return total
-
-
-def _render(
-    gaussians: Gaussians, colors: Tensor, camera: Camera, background: Tensor | None, sh_degree: int | None
-) -> tuple[Tensor, dict[str, Any]]:
-    device = gaussians.device
-    image, alpha, meta = rasterization(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        colors,
-        camera.viewmat.to(device),
-        camera.K.to(device),
-        camera.width,
-        camera.height,
-        near_plane=camera.near,
-        sh_degree=sh_degree,
-        background=None if background is None else background.to(device),
-    )
-    return image, meta | {"alpha": alpha}
 
 
 def rasterization(

@@ -15,7 +15,7 @@ from keyss.channels.names import Format
 from keyss.core.errors import InputError, UsageError
 from keyss.files.file_kinds import identify_file, is_training, is_unpacked_sog, model_file
 from keyss.files.inputs import is_standard
-from keyss.files.ply_summary import NEARLY_TRANSPARENT, summarise_ply
+from keyss.files.ply_table import NEARLY_TRANSPARENT, summarise_ply
 
 # Of a hidden model, by SH degree: `usual_size` of six models is 14 to 17, and 10 to 12.
 _BYTES_PER_GAUSSIAN = {3: 17, 0: 12}
@@ -83,15 +83,11 @@ def info(path: str | Path, *, capacity: bool = False) -> RunInfo | InterruptedRu
     try:
         if not (is_standard(path) or path.exists()):
             raise InputError(f"{path} does not exist")
-        if path.is_dir() and not _holds_a_model(path):
+        if path.is_dir() and not (is_unpacked_sog(path) or is_training(path)):
             return _folder_info(path, capacity)
         return _model_info(model_file(path), capacity)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-
-
-def _holds_a_model(folder: Path) -> bool:
-    return is_unpacked_sog(folder) or is_training(folder)
 
 
 def _folder_info(path: Path, capacity: bool) -> RunInfo | InterruptedRun | ModelInfo | SceneInfo:
@@ -154,39 +150,30 @@ def _model_info(path: Path, capacity: bool = False) -> ModelInfo:
         count, degree, transparent = summary.gaussians, summary.sh_degree, summary.nearly_transparent
         low, high = _round(summary.low), _round(summary.high)
     else:
-        model = _read_model(path)
+        from keyss.files.model_formats import known_suffixes
+        from keyss.files.models import is_model_source, read_model
+
+        if not (is_standard(path) or is_model_source(path)):
+            raise InputError(
+                f"{path}: expected a model ({known_suffixes()}), a scene folder or a result folder, found "
+                f"{identify_file(path)}"
+            )
+        model = read_model(path)
         count, degree = len(model), model.sh_degree
         low, high = _round(model.means.amin(0)), _round(model.means.amax(0))
         transparent = int((model.opacity_logits < NEARLY_TRANSPARENT).sum())
         capacities = tuple(_capacities(model)) if capacity else None
+    files = [path, *(path.parent.glob("*.webp") if is_unpacked_sog(path) else ())]
     return ModelInfo(
         kind="3DGS model",
         path=str(path),
-        bytes=None if is_standard(path) else _size_of(path),
+        bytes=None if is_standard(path) else sum(file.stat().st_size for file in files),
         gaussians=count,
         sh_degree=degree,
         bounding_box=(low, high),
         nearly_transparent=round(transparent / count, 4),
         capacity=capacities,
     )
-
-
-def _size_of(path: Path) -> int:
-    """Bytes of a model's file; of an unpacked SOG with its pictures."""
-    pictures = path.parent.glob("*.webp") if is_unpacked_sog(path) else ()
-    return sum(file.stat().st_size for file in (path, *pictures))
-
-
-def _read_model(path: Path) -> Gaussians:
-    from keyss.files.model_formats import known_suffixes
-    from keyss.files.models import is_model_source, read_model
-
-    if not (is_standard(path) or is_model_source(path)):
-        raise InputError(
-            f"{path}: expected a model ({known_suffixes()}), a scene folder or a result folder, found "
-            f"{identify_file(path)}"
-        )
-    return read_model(path)
 
 
 def _capacities(model: Gaussians) -> Iterator[str]:

@@ -6,7 +6,6 @@ Does not import torch.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -30,22 +29,16 @@ _SECONDS = {
 }
 
 
-def seconds_for(task: str, model: Path) -> float:
-    """About the seconds that a task takes, one of `_SECONDS`."""
-    return _START + _SECONDS[task] * gaussians_in(model) / 1e6
+def seconds_for(task: str, *models: object) -> float:
+    """About the seconds that a task takes, one of `_SECONDS`; folders of photos do not count."""
+    paths = [Path(model) for model in models if isinstance(model, str | Path)]
+    return _START + _SECONDS[task] * sum(map(gaussians_in, paths)) / 1e6
 
 
 def seconds_to_convert(model: Path, out: Path, keys: int) -> float:
     """About the seconds to convert a model and to open its secrets before and after."""
     per_million = (format_of(out) or PLY).write_seconds + 2 * keys * _SECONDS["reveal"]
     return _START + per_million * gaussians_in(model) / 1e6
-
-
-def seconds_to_prepare(sources: Sequence[object]) -> float:
-    """About the seconds to read models and to find what can be written in them; photos do not count."""
-    paths = [Path(source) for source in sources if isinstance(source, str | Path)]
-    count = sum(gaussians_in(path) for path in paths if path.is_file())
-    return _START + _SECONDS["prepare"] * count / 1e6
 
 
 def gaussians_in(path: Path) -> float:

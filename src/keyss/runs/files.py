@@ -13,7 +13,7 @@ from keyss.core.scene import Scene, ViewOptions
 from keyss.files.file_kinds import identify_file
 from keyss.files.model_formats import DECODED_SUFFIX, known_suffixes
 from keyss.files.models import is_model_source, read_model
-from keyss.methods.companion import SUFFIX
+from keyss.methods.hidden import COMPANION
 from keyss.runs.folder import CHECKPOINTS, HIDE_FILES, MANIFEST, PRIVATE, PUBLISH, read_manifest
 
 STEGO = f"{PUBLISH}/model.ply"  # an innocuous name
@@ -93,7 +93,7 @@ def bound_names(secrets: int) -> list[str]:
 
 def companion_names(secrets: int) -> list[str]:
     """Companion files of the secrets, for methods that need them."""
-    return [f"{COMPANIONS}/secret-{index}{SUFFIX}" for index in range(1, secrets + 1)]
+    return [f"{COMPANIONS}/secret-{index}{COMPANION}" for index in range(1, secrets + 1)]
 
 
 def path_of(source: PathLike | Scene | Gaussians) -> str | None:

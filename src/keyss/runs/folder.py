@@ -150,13 +150,11 @@ class RunFolder:
                 f"{self.path} holds an interrupted run of another kind ({running.stage}, not {self.stage})"
             )
         if running.arguments != self.arguments:
-            before = running.arguments | {"keys": self.arguments.get("keys")}
-            if before == self.arguments or "keys" not in self.arguments:  # verifiers depend on the others
-                before = running.arguments
-            changes = "; ".join(_differences(before, self.arguments))
+            changes = _differences(running.arguments, self.arguments)
+            own = [change for change in changes if not change.startswith("keys: ")]  # verifiers depend on all
             raise OutputError(
-                f"{self.path} holds an interrupted run with other arguments ({changes}): give the same ones, "
-                "or start anew with `overwrite=True`"
+                f"{self.path} holds an interrupted run with other arguments ({'; '.join(own or changes)}): "
+                "give the same ones, or start anew with `overwrite=True`"
             )
 
     @contextmanager

@@ -18,7 +18,6 @@ from keyss.fitting.config import FitConfig
 from keyss.fitting.losses import Targets
 from keyss.kernels.memory import available_memory
 from keyss.methods.method import MethodOptions, Plan, Prepared, Source, seconds_to_hide
-from keyss.methods.plain_models import Bound
 from keyss.progress import about
 
 _STEP_SECONDS = {"cpu": 5e-7, "cuda": 6e-9}  # per training step, Gaussian and two pixels
@@ -85,12 +84,11 @@ def cost_of(
         size = fit.max_gaussians if known is None else len(known)
         plain_steps = plain.iterations if source.given is None else 0
         renders = plain_steps + training.steps * training.step_cost
-        longer = Bound.of(training, plain_steps or None)
-        if bound and source.photos and not longer.equal:
-            renders += longer.steps or 0
+        if bound and source.photos and not training.keeps_bound(plain_steps or None):
+            renders += training.total(plain_steps or None) or 0
             saved.append(size)
             written.append(size)
-        step = step_seconds(device.type, size, _pixels(source.scene))
+        step = _STEP_SECONDS[device.type] * (size + _pixels(source.scene) / 2)
         seconds += renders * step
         views.append(view_seconds(device.type, size, source.scene))
         check_seconds += len(source.scene.test) * views[-1] + _READ_SECONDS * size
@@ -124,11 +122,6 @@ def view_seconds(device: str, gaussians: int, scene: Scene) -> float:
     """About the seconds to measure a model, and its plain model, on one test view of a scene."""
     per_gaussian, per_pixel = _VIEW_SECONDS[device]
     return per_gaussian * gaussians + per_pixel * _pixels(scene)
-
-
-def step_seconds(device: str, gaussians: int, pixels: int) -> float:
-    """About the seconds of a training step on a device, "cpu" or "cuda"."""
-    return _STEP_SECONDS[device] * (gaussians + pixels / 2)
 
 
 def _pixels(scene: Scene) -> int:

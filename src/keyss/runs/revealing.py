@@ -12,8 +12,8 @@ from keyss.channels import copies
 from keyss.core.errors import InputError, UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.files.inputs import read_file
-from keyss.methods import companion as companions, registry
-from keyss.methods.hidden import Frame, HiddenFile, HiddenScene, Recovered
+from keyss.methods import registry
+from keyss.methods.hidden import MAX_COMPANION_BYTES, Frame, HiddenFile, HiddenScene, Recovered
 from keyss.runs.files import PathLike
 
 MIN_LEFT = 0.1  # share; pruning compensation stops there, and renders become empty
@@ -23,6 +23,13 @@ _SAMPLE = 200_000  # Gaussians from which the visible part is measured
 _FAR, _ENORMOUS = 1000.0, 100.0  # radii of the visible part
 _MAX_HARMONIC = 1000.0
 _MIN_QUATERNION = 1e-12  # length
+_PROBLEMS = {
+    "duplicates": "copied from others",
+    "no_rotation": "with a quaternion of length 0",
+    "far": f"more than {_FAR:,.0f} times as far out as visible ones",
+    "enormous": f"more than {_ENORMOUS:,.0f} times as large as the visible part",
+    "out_of_range": f"with harmonics beyond {_MAX_HARMONIC:,.0f}",
+}
 
 
 @dataclass(frozen=True)
@@ -107,7 +114,7 @@ def _count(recovered: Recovered) -> str:
 
 def read_companion(path: PathLike) -> HiddenScene:
     """Open the secret in a companion file; see `registry.open_companion`."""
-    data = read_file(Path(path), companions.MAX_BYTES)
+    data = read_file(Path(path), MAX_COMPANION_BYTES)
     try:
         return registry.open_companion(data)
     except InputError as error:
@@ -173,18 +180,8 @@ def check_model(model: Gaussians) -> ModelCheck:
         "enormous": int((visible & (model.log_scales.amax(1).double().exp() > _ENORMOUS * radius)).sum()),
         "out_of_range": int((torch.maximum(harmonics.amax(1), -harmonics.amin(1)) > _MAX_HARMONIC).sum()),
     }
-    words = {
-        "duplicates": "copied from others",
-        "no_rotation": "with a quaternion of length 0",
-        "far": f"more than {_FAR:,.0f} times as far out as visible ones",
-        "enormous": f"more than {_ENORMOUS:,.0f} times as large as the visible part",
-        "out_of_range": f"with harmonics beyond {_MAX_HARMONIC:,.0f}",
-    }
-    problems = [
-        f"{count:,} Gaussians {words[name]}"
-        for name, count in counts.items()
-        if (suspicious if name == "duplicates" else count)
-    ]
+    wrong = counts if suspicious else counts | {"duplicates": 0}
+    problems = [f"{count:,} Gaussians {_PROBLEMS[name]}" for name, count in wrong.items() if count]
     if not visible.any():
         problems.append("all Gaussians are invisible")
     return ModelCheck(

@@ -13,7 +13,7 @@ from keyss.core.errors import InputError
 from keyss.core.scene import ViewOptions
 from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import ImageQuality
-from keyss.measure.hide_quality import HidingQuality, RenderFidelity
+from keyss.measure.hide_quality import BaselineQuality, RenderFidelity, WrongKeys
 from keyss.methods import registry
 from keyss.methods.hidden import HiddenScene
 from keyss.methods.method import MethodOptions
@@ -81,12 +81,17 @@ def secret_ids(seed: int, opened: Iterable[HiddenScene]) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class HideMetrics(HidingQuality):
+class HideMetrics:
     """Results of a hiding: PSNRs in dB and SSIMs on test views, measured through the written files."""
 
     version: int = 1
     keyss: str = __version__  # the program that wrote it
     method: str
+    cover: ImageQuality
+    secrets: tuple[ImageQuality, ...]
+    baseline: BaselineQuality
+    wrong_key: WrongKeys | None  # None for methods without a keyed decoder
+    chance_level: tuple[float, ...]  # dB, the stego model itself against each secret's test views
     gaussians: int  # Gaussians of the stego model
     photos: tuple[bool, ...]  # cover, then secrets; False: test views are renders of a given model
     secret_gaussians: tuple[int, ...]  # Gaussians of each revealed secret

@@ -214,10 +214,10 @@ def payload(data: bytes, rng: Random) -> bytes:
     return bytes(changed) + (zeros(rng) if rng.random() < 0.5 else b"")
 
 
-def image(kind: str, width: int, height: int, **options: Any) -> bytes:
-    """An image of one colour, a few bytes at any size."""
+def image(kind: str, width: int, height: int, alpha: int = 0, **options: Any) -> bytes:
+    """A black image, a few bytes at any size."""
     found = io.BytesIO()
-    Image.new("RGBA", (width, height)).save(found, kind, **options)
+    Image.new("RGBA", (width, height), (0, 0, 0, alpha)).save(found, kind, **options)
     return found.getvalue()
 
 

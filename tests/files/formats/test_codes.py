@@ -111,44 +111,6 @@ def rotation_bound(step: float) -> float:
     return float(np.degrees(2 * np.sqrt(3 + 3**2) * step / 2)) * 1.001
 
 
-def spz_harmonics_bound(degree: int) -> torch.Tensor:
-    """[K - 1, 1] half a step of 5 bits in degree 1 and of 4 bits above, after rounding to 8 bits."""
-    steps = torch.tensor([8] * 3 + [16] * 12)[: (degree + 1) ** 2 - 1, None]
-    return (steps / 2 + 0.5) / 128 + 1e-6
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_quantisation_error_of_spz(degree: int) -> None:
-    model = model_of(400, degree)
-    found = SpzCodes.quantise(model).dequantise()
-    assert worst(found.means, model.means) <= 0.5 / 4096 + 1e-6
-    assert worst(found.log_scales, model.log_scales) <= 0.5 / 16 + 1e-6
-    assert worst(found.opacities, model.opacities) <= 0.5 / 255 + 1e-6
-    assert worst(found.sh[:, 0], model.sh[:, 0]) <= 0.5 / 38.25 + 1e-6
-    errors = found.sh[:, 1:] - model.sh[:, 1:].clamp(-1, 127 / 128)
-    assert bool((errors.abs() <= spz_harmonics_bound(degree)).all())
-    assert angle(found, model) <= rotation_bound(0.5**0.5 / 511)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_quantisation_error_of_compressed_ply(degree: int) -> None:
-    model = model_of(600, degree)
-    found = CompressedPlyCodes.quantise(model).dequantise()
-    for start in range(0, 600, 256):
-        part, near = model[start : start + 256], found[start : start + 256]
-        for name, bits in (("means", (11, 10, 11)), ("log_scales", (11, 10, 11))):
-            values = getattr(part, name)
-            step = (values.amax(0) - values.amin(0)) / (2.0 ** torch.tensor(bits) - 1)
-            assert bool(((getattr(near, name) - values).abs() <= 0.5 * step + 1e-5).all())
-        colors = part.sh[:, 0]
-        step = (colors.amax(0) - colors.amin(0)) / 255
-        assert bool(((near.sh[:, 0] - colors).abs() <= 0.5 * step + 1e-5).all())
-    assert worst(found.opacities, model.opacities) <= 0.5 / 255 + 1e-6
-    if degree:
-        assert worst(found.sh[:, 1:], model.sh[:, 1:]) <= 0.5 / 32 + 1e-6
-    assert angle(found, model) <= rotation_bound(2**0.5 / 1023)
-
-
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_quantisation_error_of_sog(degree: int) -> None:
     model = model_of(400, degree)

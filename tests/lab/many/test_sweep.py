@@ -15,10 +15,11 @@ import pytest
 import keyss as library
 from cli.harness import Run
 from keyss.core import BackendError, InputError
-from keyss.lab.many import Forecast, Outcome, sweep
+from keyss.files import write_bytes
+from keyss.lab.many import Forecast, Outcome, sweep, trial, trial_folder
+from keyss.progress import Reporter
+from keyss.runs import record_bytes
 from tiny_scenes import random_gaussians
-
-fake_runs = pytest.mark.usefixtures("_fake_runs")
 
 GOOD = """
 pairs:
@@ -26,6 +27,25 @@ pairs:
 methods:
   - {method: carry, preset: quick, grid: {fit.sh_degree: [1, 3], fit.iterations: [10, 20]}}
 """
+
+
+def fake_run(job: trial.Trial, folder: Path, reporter: Reporter) -> trial.Result:
+    """Numbers that depend on the seed; covers with "broken" or "odd" in their names fail."""
+    if "broken" in Path(job.cover).name:
+        raise InputError(f"{job.cover}: nothing of it can be read")
+    if "odd" in Path(job.cover).name:
+        raise RuntimeError("out of memory")
+    seed = getattr(job.options, "fit", job.options).known_seed
+    folder.mkdir(parents=True)
+    numbers = {"cover.psnr": 30.0 + seed, "cover.ssim": 0.9, "secrets.1.psnr": 20.0, "seconds": 1.0}
+    result = trial.Result(seconds=0.1, numbers=numbers)
+    write_bytes(folder / "result.json", record_bytes(result))
+    return result
+
+
+@pytest.fixture
+def _fake_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trial_folder, "run_trial", fake_run)
 
 
 @pytest.fixture
@@ -105,7 +125,7 @@ def skipped(found: tuple[Outcome, ...]) -> list[bool]:
     return [each.skipped for each in found]
 
 
-@fake_runs
+@pytest.mark.usefixtures("_fake_runs")
 def test_trials_run_once(tmp_path: Path) -> None:
     spec = write_spec(tmp_path, ["a.ply", "b.ply"], seeds=3)
     first = run(spec, tmp_path / "out")
@@ -132,7 +152,7 @@ def test_trials_run_once(tmp_path: Path) -> None:
     assert "seconds" not in (tmp_path / "out" / "trials.csv").read_text()  # they differ from run to run
 
 
-@fake_runs
+@pytest.mark.usefixtures("_fake_runs")
 def test_changed_files_and_options(tmp_path: Path) -> None:
     spec = write_spec(tmp_path, ["a.ply"], seeds=2)
     out = tmp_path / "out"
@@ -144,7 +164,7 @@ def test_changed_files_and_options(tmp_path: Path) -> None:
     assert skipped(run(spec, out)) == [True, True]
 
 
-@fake_runs
+@pytest.mark.usefixtures("_fake_runs")
 def test_failed_trials(tmp_path: Path, keyss: Run, capsys: pytest.CaptureFixture[str]) -> None:
     """Errors of users and internal errors."""
     spec = write_spec(tmp_path, ["broken.ply", "odd.ply", "a.ply"], seeds=1)

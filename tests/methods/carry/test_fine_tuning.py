@@ -52,6 +52,8 @@ def test_fine_tuning_steps() -> None:
     cover, small, large = trained_like(2500), trained_like(300, 1), trained_like(6000, 2)
     options = CarryOptions(fit=FIT)
     assert _steps(options, _source(cover), _source(large)) == [400]
+    assert _steps(replace(options, fine_tune="never"), _source(cover), _source(large)) == [0]
+    assert _steps(replace(options, fine_tune="always"), _source(cover), _source(small)) == [400]
     assert _steps(options, _source(cover), _source(large, photos=True)) == [1150]
     assert _steps(options, _source(cover), _source(small), _source(large)) == [0, 400]
     assert [fit.iterations for fit in options.fits(3)] == [1000, 2150, 2150]  # those of fine-tuning, too
@@ -86,14 +88,6 @@ def test_shared_capacity_warns() -> None:
         keyss.hide(
             cover, secrets, method=CarryOptions(fine_tune="never"), views=keyss.ViewOptions(24), min_psnr=0
         )
-
-
-def test_fine_tuning_option() -> None:
-    cover, secret, large = trained_like(2500), trained_like(900, 1), trained_like(6000, 2)
-    always, never = CarryOptions(fine_tune="always"), CarryOptions(fine_tune="never")
-    assert _steps(always, _source(cover), _source(secret)) == [400]
-    assert _steps(never, _source(cover), _source(secret)) == [0]
-    assert _steps(never, _source(cover), _source(large)) == [0]
 
 
 @pytest.mark.parametrize(("format", "secrets"), [("ply", 3), ("spz", 1)])

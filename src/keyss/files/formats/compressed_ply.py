@@ -61,7 +61,6 @@ class CompressedPlyCodes(Codes):
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
-        """See `Codes`."""
         tables, comments = read_tables(io.BytesIO(data))
         vertex, chunk = tables["vertex"], tables.get("chunk")
         n = len(vertex)

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -54,14 +54,17 @@ _MAX_PARTS = 64  # primitives with Gaussians, each counted once per node
 _VALUES_PER_BYTE = 4  # maximum; accessors that share bytes, and nodes that share a mesh, exceed it
 
 
+_Natural = Annotated[int, msgspec.Meta(ge=0)]
+
+
 class _Accessor(msgspec.Struct, omit_defaults=True):
     """Typed values in a buffer view."""
 
-    count: int
+    count: _Natural
     type: str
     componentType: int
-    bufferView: int | None = None
-    byteOffset: int = 0
+    bufferView: _Natural = 1 << 32  # a missing one: values that are all 0 are no Gaussians
+    byteOffset: _Natural = 0
     normalized: bool = False
     min: list[float] = []
     max: list[float] = []
@@ -70,15 +73,15 @@ class _Accessor(msgspec.Struct, omit_defaults=True):
 
 class _BufferView(msgspec.Struct, omit_defaults=True):
     buffer: int
-    byteOffset: int = 0
-    byteLength: int = 0
+    byteOffset: _Natural = 0
+    byteLength: _Natural = 0
     byteStride: int | None = None
     target: int | None = None
 
 
 class _Node(msgspec.Struct, omit_defaults=True):
-    mesh: int | None = None
-    children: list[int] = []
+    mesh: _Natural | None = None
+    children: list[_Natural] = []
     matrix: list[float] | None = None
     translation: list[float] | None = None
     rotation: list[float] | None = None
@@ -86,7 +89,7 @@ class _Node(msgspec.Struct, omit_defaults=True):
 
 
 class _Primitive(msgspec.Struct, omit_defaults=True):
-    attributes: dict[str, int] = {}  # indices of accessors
+    attributes: dict[str, _Natural] = {}  # indices of accessors
     mode: int = 4
     extensions: dict[str, dict[str, Any]] = {}
 
@@ -95,13 +98,17 @@ class _Mesh(msgspec.Struct):
     primitives: list[_Primitive]
 
 
+class _Scene(msgspec.Struct):
+    nodes: list[_Natural] = []
+
+
 class _Document(msgspec.Struct, omit_defaults=True):
     """The part of a glTF document used here."""
 
     asset: dict[str, Any] = {}
     extensionsUsed: list[str] = []
-    scene: int | None = None
-    scenes: list[dict[str, Any]] = []
+    scene: _Natural | None = None
+    scenes: list[_Scene] = []
     nodes: list[_Node] = []
     buffers: list[dict[str, Any]] = []
     bufferViews: list[_BufferView] = []
@@ -173,7 +180,7 @@ def write(model: Gaussians) -> bytes:
         asset={"version": "2.0", "generator": "keyss"},
         extensionsUsed=[EXTENSION],
         scene=0,
-        scenes=[{"nodes": [0]}],
+        scenes=[_Scene([0])],
         nodes=[_Node(mesh=0, rotation=list(_TURN))],
         buffers=[{"byteLength": len(binary)}],
         bufferViews=views,
@@ -229,18 +236,16 @@ def _instances(document: _Document) -> Iterator[tuple[Doubles, _Primitive]]:
         for mesh in document.meshes
     ]
     try:
-        roots = range(len(document.nodes))
+        roots: Sequence[int] = range(len(document.nodes))
         if document.scenes:
-            roots = document.scenes[document.scene or 0].get("nodes", [])
+            roots = document.scenes[document.scene or 0].nodes
         # Nodes with those above them, which transform only what has Gaussians.
-        stack: list[tuple[int, tuple[_Node, ...]]] = [
-            (index, ()) for index in roots if isinstance(index, int)
-        ]
+        stack: list[tuple[int, tuple[_Node, ...]]] = [(index, ()) for index in roots]
         visited: set[int] = set()
         left = _MAX_PARTS
         while stack:
             index, above = stack.pop()
-            if index in visited or len(above) > _MAX_DEPTH or index < 0:
+            if index in visited or len(above) > _MAX_DEPTH:
                 raise damaged("glTF", "its nodes are not a tree")
             visited.add(index)
             node = document.nodes[index]
@@ -255,7 +260,7 @@ def _instances(document: _Document) -> Iterator[tuple[Doubles, _Primitive]]:
             if primitives:
                 to_scene = reduce(np.matmul, map(_transform, path))
                 yield from ((to_scene, primitive) for primitive in primitives)
-    except (IndexError, TypeError) as error:
+    except IndexError as error:
         raise damaged("glTF", "it refers to a missing part") from error
 
 
@@ -347,15 +352,14 @@ def _attributes(document: _Document, primitive: _Primitive, binary: memoryview) 
 
 def _values(document: _Document, index: int, width: int, binary: memoryview) -> _Values:
     """The values [N, width] of an accessor into the binary chunk."""
-    if not 0 <= index < len(document.accessors):
-        raise damaged("glTF", "it refers to a missing accessor")
-    accessor = document.accessors[index]
+    try:
+        accessor = document.accessors[index]
+        view = document.bufferViews[accessor.bufferView]
+    except IndexError as error:
+        raise damaged("glTF", "it refers to a missing part") from error
     code = _COMPONENTS.get(accessor.componentType)
     if accessor.sparse is not None or code is None or _WIDTHS.get(accessor.type) != width:
         raise damaged("glTF", f"expected an accessor of {width} numbers each")
-    if accessor.bufferView is None or not 0 <= accessor.bufferView < len(document.bufferViews):
-        raise damaged("glTF", "it refers to a missing buffer view")
-    view = document.bufferViews[accessor.bufferView]
     if view.buffer != 0 or any("uri" in buffer for buffer in document.buffers[:1]):
         raise InputError("expected a .glb that contains its data, found one that refers to other files")
     dtype = np.dtype(code)
@@ -363,8 +367,7 @@ def _values(document: _Document, index: int, width: int, binary: memoryview) -> 
     stride = view.byteStride or row
     start, end = view.byteOffset + accessor.byteOffset, view.byteOffset + view.byteLength
     needed = (accessor.count - 1) * stride + row
-    is_sound = min(accessor.count, view.byteOffset, accessor.byteOffset) >= 0 and stride >= row
-    if not is_sound or (accessor.count and start + needed > min(end, len(binary))):
+    if stride < row or (accessor.count and start + needed > min(end, len(binary))):
         raise damaged("glTF", "an accessor exceeds its buffer view")
     shape, strides = (accessor.count, width), (stride, dtype.itemsize)
     stored = np.ndarray(shape, dtype, binary, start, strides) if accessor.count else np.empty(shape)

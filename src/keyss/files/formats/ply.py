@@ -7,7 +7,7 @@ coefficients, then green, then blue). A .ply of another program may have further
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -90,7 +90,7 @@ def write(model: Gaussians, file: BinaryIO) -> None:
     extras = model.extras if isinstance(model, _ExtendedGaussians) else _Extras()
     flat = writable(model)
     n, needed = len(flat), model_names(flat.sh.shape[1])
-    names = _names_with_normals(needed)
+    names = [*needed[:3], *_NORMALS, *needed[3:]]
     further = {name: values for name, values in extras.properties.items() if name not in _NORMALS}
     types = dict.fromkeys(names, "f4") | {name: column.dtype.str[1:] for name, column in further.items()}
     order = [name for name in extras.order if name in types]
@@ -167,8 +167,3 @@ def _read_extras(path: Path, count: int) -> _Extras | None:
     if any(len(column) != count for column in values.values()):
         raise InputError(f"{path}: it changed while it was read")
     return _Extras(tuple(vertices.comments), order, values)
-
-
-def _names_with_normals(names: Sequence[str]) -> list[str]:
-    """All properties of Inria's layout, from those that make a model."""
-    return [*names[:3], *_NORMALS, *names[3:]]

@@ -105,7 +105,6 @@ class SogCodes(Codes):
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
-        """See `Codes`."""
         file = _open_archive(data)
         meta = _read_meta(file("meta.json"))
         n = meta.count

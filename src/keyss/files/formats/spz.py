@@ -209,7 +209,6 @@ class SpzCodes(Codes):
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
-        """See `Codes`."""
         header, body, extensions = _unpack_gzip(data) if data.startswith(GZIP) else _unpack_zstd(data)
         n = header.gaussians
         sections = np.split(np.frombuffer(body, np.uint8), np.cumsum(header.sizes)[:-1])

@@ -3,36 +3,25 @@
 from __future__ import annotations
 
 import time
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from keyss.core import (
-    BackendError,
-    InputError,
-    Interrupted,
-    KeyssWarning,
-    UsageError,
-    import_extra,
-    signal_of,
-)
+from keyss.core import InputError, Interrupted, UsageError, import_extra
 from keyss.files import write_bytes
-from keyss.fitting import FitConfig
-from keyss.lab.audits.parts import PARTS, Part, Progress
+from keyss.lab.audits.parts import PARTS, Part
 from keyss.lab.audits.record import Audit
 from keyss.lab.audits.report import report_of
-from keyss.lab.audits.subject import Subject, control_name
+from keyss.lab.audits.subject import Subject
 from keyss.methods import registry
-from keyss.progress import Reporter, Share, reporter as default_reporter
+from keyss.progress import Reporter, reporter as default_reporter
 from keyss.rendering import Backend, resolve_device
 from keyss.runs import read_record, write_record
 from keyss.runs.estimates import seconds_for
-from keyss.runs.files import CONTROLS, REPORT, PathLike, as_scene, run_folder, stego_in
+from keyss.runs.files import REPORT, PathLike, run_folder, stego_in
 from keyss.runs.folder import PRIVATE, RunFolder, read_manifest
 from keyss.runs.open_run import open_run, read_run
-from keyss.runs.planning import cost_of_fit, view_seconds
 
 AUDIT, PICTURES = f"{PRIVATE}/audit/audit.json", f"{PRIVATE}/audit/pictures"  # relative to the run
 EXTRA = ("ot", "sklearn")
@@ -57,7 +46,6 @@ def audit(
     seed: int = 0,
     device: Backend = "auto",
     overwrite: bool = False,
-    resume: bool = False,
     reporter: Reporter | None = None,
 ) -> Audit:
     """Measure quality, stealth, leaks, robustness and speed of a folder of `hide`.
@@ -66,13 +54,14 @@ def audit(
     compare with; at least 2, kept in `private/controls/`. `only`: names of parts, by default all.
 
     The folder gets `private/audit/` with pictures and `audit.json`, which is also returned, and
-    `private/report.md`. Other parts of an earlier audit with the same controls stay. `resume` continues an
-    interrupted audit after its finished parts. Raises KeyssError (BackendError without the extra `audit`),
-    and Interrupted on Ctrl-C.
+    `private/report.md`. Other parts of an earlier audit with the same controls stay. The same call continues
+    an interrupted audit after its finished parts. Raises KeyssError (BackendError without the extra `audit`)
+    and KeyboardInterrupt.
     """
     if controls < 2:
         raise UsageError(f"expected at least 2 plain models to compare with, got {controls}")
-    _check_extras()
+    for module in EXTRA:
+        import_extra(module, "audit", "audit a run")
     _, config, *_ = read_run(Path(run))
     parts = _chosen(only, config.method)
     started, reporter = time.monotonic(), reporter or default_reporter()
@@ -80,20 +69,26 @@ def audit(
         opened = open_run(run, keys)
     subject = Subject(opened, resolve_device(device))
     settings = {"controls": controls, "only": only, "seed": seed, "device": subject.device.type}
-    seeds = _seeds(opened.config.options.fit, controls, seed)
+    fit = opened.config.options.fit
+    seeds = tuple(fit.seed_of(f"control {seed + index}") for index in range(controls))
     earlier = _earlier(opened.folder, seeds)
-    adds = not resume and earlier is not None and not earlier.sections.keys() & parts.keys()
+    adds = earlier is not None and not earlier.sections.keys() & parts.keys()
+    running = read_manifest(opened.folder).running
+    resume = running is not None and running.stage == "audit" and not overwrite
     folder = RunFolder(
         opened.folder,
         "audit",
         settings | {"payloads": opened.config.payloads},
         onto=KEPT,
         writes=(AUDIT, REPORT),
-        overwrite=overwrite or (adds and read_manifest(opened.folder).running is None),
+        overwrite=overwrite or (adds and running is None),
         resume=resume,
     )
-    with folder.work(), _resumable(folder.checkpoints):
-        subject.fit_controls(seeds, folder, reporter)
+    with folder.work():
+        try:
+            subject.fit_controls(seeds, folder, reporter)
+        except Interrupted as error:  # its message says how to resume a fit
+            raise KeyboardInterrupt(*error.args) from error
         record, pictures = folder.checkpoints / "audit.json", folder.checkpoints / "pictures"
         cover, *secrets = opened.sources
         result = Audit(
@@ -114,7 +109,7 @@ def audit(
                 continue
             seconds = part.work.time(subject.view_seconds, len(subject.stego))
             with reporter.waiting(f"audit, {number} of {len(parts)}: {name}", seconds) as share:
-                section, shown = part.measure(subject, seed, _in_shares(share))
+                section, shown = part.measure(subject, seed, share)
             pictures.mkdir(exist_ok=True)
             names = {caption: f"{name}-{index}.png" for index, caption in enumerate(shown, start=1)}
             for caption, file in names.items():
@@ -131,11 +126,6 @@ def audit(
         report = report_of(result, PICTURES.removeprefix(f"{PRIVATE}/"))
         folder.write({AUDIT: result, REPORT: report.encode(errors="replace"), **contents})
     return result
-
-
-def _check_extras() -> None:
-    for module in EXTRA:
-        import_extra(module, "audit", "audit a run")
 
 
 def _earlier(run: Path, controls: tuple[int, ...]) -> Audit | None:
@@ -158,48 +148,3 @@ def _chosen(only: Sequence[str], method: str) -> dict[str, Part]:
             f"{' and '.join(impossible)} measure: leave out `only`, or name other parts"
         )
     return {name: part for name, part in parts.items() if name in (only or parts)}
-
-
-def _seeds(fit: FitConfig, controls: int, seed: int) -> tuple[int, ...]:
-    """The seeds of the controls."""
-    return tuple(fit.seed_of(f"control {seed + index}") for index in range(controls))
-
-
-def forecast_audit(
-    run: PathLike, *, controls: int = 3, only: Sequence[str] = (), seed: int = 0, device: Backend = "auto"
-) -> dict[str, float]:
-    """About the seconds of each part of an audit, and of the training of missing controls; needs no keys.
-
-    Warns (KeyssWarning) without the extra `audit`.
-    """
-    try:
-        _check_extras()
-    except BackendError as error:
-        warnings.warn(str(error), KeyssWarning, stacklevel=2)
-    folder, config, metrics, sources = read_run(Path(run))
-    parts, target = _chosen(only, config.method), resolve_device(device)
-    scenes = [as_scene(source, config.views, train_pictures=False) for source in sources]
-    counts = [metrics.gaussians, *metrics.secret_gaussians]
-    views = sum(view_seconds(target.type, *pair) for pair in zip(counts, scenes, strict=True))
-    names = [control_name(number, "*") for number in _seeds(config.options.fit, controls, seed)]
-    missing = sum(not any((folder / CONTROLS).glob(name)) for name in names)
-    return {
-        "controls": missing * cost_of_fit(scenes[0], config.options.fit, target).seconds,
-        **{name: part.work.time(views, metrics.gaussians) for name, part in parts.items()},
-    }
-
-
-def _in_shares(share: Share) -> Progress:
-    return lambda done, of: share(done / of)
-
-
-@contextmanager
-def _resumable(checkpoints: Path) -> Iterator[None]:
-    """Turn any interrupt into Interrupted, which says how to continue."""
-    try:
-        yield
-    except Interrupted:
-        raise
-    except KeyboardInterrupt as error:
-        saved = any(not path.name.startswith(".") for path in checkpoints.iterdir())
-        raise Interrupted(checkpoints if saved else None, None, signal_of(error)) from error

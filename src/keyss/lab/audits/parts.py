@@ -33,6 +33,7 @@ from keyss.lab.two_sample import two_sample_auc
 from keyss.measure.hide_quality import WrongKeys
 from keyss.measure.renders import contact_sheet, renders_of, select_views
 from keyss.methods.method import role_of
+from keyss.progress import Share
 
 QUALITY_LOSS = 1.0  # dB of cover or secret below the plain model of the same scene
 INVISIBLE = 45.0  # dB: a higher PSNR makes no visible difference
@@ -46,16 +47,15 @@ PRUNING, PRUNED = "random pruning", 0.25  # the attack, and its share of the Gau
 PRUNING_LOSS = 1.5  # dB that the secret may lose more than the cover
 _PICTURED_VIEWS, _LISTED = 3, 15
 
-Progress = Callable[[int, int], None]  # called with the number of finished items and the total
 Pictures = dict[str, bytes]  # PNG files by caption
 
 
-def images(subject: Subject, seed: int, progress: Progress) -> tuple[Section, Pictures]:
+def images(subject: Subject, seed: int, share: Share) -> tuple[Section, Pictures]:
     """Compare cover and secrets with the test views, beside plain models."""
     verdicts, rows, pictures = [], [], {}
     numbers: dict[str, Any] = {}
     for index, (scene, model, plain) in enumerate(subject.shown):
-        progress(index, len(subject.scenes))
+        share(index / len(subject.scenes))
         name, photos = role_of(index, len(subject.scenes)), subject.run.metrics.photos[index]
         columns = {"photo" if photos else "given model": [view.image.numpy() for view in scene.test]}
         models = {"revealed" if index else "published model": model, "plain model": plain}
@@ -120,15 +120,14 @@ def wrong_key_verdicts(wrong: WrongKeys, chance_level: Sequence[float]) -> list[
     return verdicts
 
 
-def parameters(subject: Subject, seed: int, progress: Progress) -> tuple[Section, Pictures]:
+def parameters(subject: Subject, seed: int, share: Share) -> tuple[Section, Pictures]:
     """Distances of the parameters from plain models: published 3D-Sinkhorn, Wasserstein, a classifier."""
     original, stego, controls = subject.original, subject.stego, subject.controls
-    progress(0, 3)
     sinkhorn, score = published_distance(subject, stego)
     between = [sinkhorn_3d(original, control) for control in controls]
-    progress(1, 3)
+    share(1 / 3)
     distances = against_controls(stego, controls, original=original, seed=seed)
-    progress(2, 3)
+    share(2 / 3)
     auc = partial(two_sample_auc, seed=seed)
     aucs = {
         "published model": [auc(control, stego) for control in controls],
@@ -189,9 +188,8 @@ def two_sample_verdict(stego: Sequence[Auc], control: Sequence[Auc], original: S
     return Verdict("classifier between models", f"AUC {best:.2f}", beside, f"at most {limit:.2f}", word)
 
 
-def stealth(subject: Subject, seed: int, progress: Progress) -> tuple[Section, Pictures]:
+def stealth(subject: Subject, seed: int, share: Share) -> tuple[Section, Pictures]:
     """Compare statistics of the file with plain models."""
-    progress(0, 1)
     result = judge(subject.stego, subject.controls, original=subject.original)
     heads = ("least likely statistics", "file", "controls, minimum", "maximum", "p", "p without controls")
     rows = [
@@ -216,9 +214,8 @@ def stealth_verdicts(result: StealthResult) -> list[Verdict]:
     return [Verdict("the file by itself", value, beside, f"at least {UNUSUAL}", word)]
 
 
-def stegexpose(subject: Subject, seed: int, progress: Progress) -> tuple[Section, Pictures]:
+def stegexpose(subject: Subject, seed: int, share: Share) -> tuple[Section, Pictures]:
     """StegExpose on renders of the stego model and of plain models."""
-    progress(0, 1)
     stego, control = stegexpose_aucs(subject, [subject.stego, subject.controls[1]])
     verdicts = [stegexpose_verdict(stego, control)]
     return Section(verdicts=verdicts, numbers=_builtins({"stego": stego, "control": control})), {}
@@ -244,12 +241,12 @@ def stegexpose_aucs(subject: Subject, models: Sequence[Gaussians]) -> list[Auc]:
     return [stegexpose_auc(plain, renders) for renders in others]
 
 
-def leaks(subject: Subject, seed: int, progress: Progress) -> tuple[Section, Pictures]:
+def leaks(subject: Subject, seed: int, share: Share) -> tuple[Section, Pictures]:
     """Attacks without the key on each secret, with the file or with its decoder."""
     heads = ("PSNR, dB (leak)", "SSIM (leak)", "gradients (leak)", "variant", "what it does")
     tables, results, pictures = [], {}, {}
     for index, (secret, opened) in enumerate(zip(subject.in_cover, subject.run.opened, strict=True), start=1):
-        progress(index - 1, len(subject.in_cover))
+        share((index - 1) / len(subject.in_cover))
         attacks = file_attacks(subject.scenes[0], seed=seed)
         if opened.decode is not None:
             attacks.append(decoder_attack(opened.decode, opened.key_size, seed=seed))
@@ -287,10 +284,10 @@ def leak_verdicts(results: Mapping[str, Sequence[AttackResult]]) -> list[Verdict
     return [Verdict("leaks without the key", f"{value} ({where})", "0, plain models", limit, word)]
 
 
-def robustness(subject: Subject, seed: int, progress: Progress) -> tuple[Section, Pictures]:
+def robustness(subject: Subject, seed: int, share: Share) -> tuple[Section, Pictures]:
     """PSNR loss of the cover and the secrets when the stego model changes."""
     openers, scenes = subject.run.openers, subject.scenes
-    results = measure_robustness(subject.stego, openers, scenes, seed=seed, progress=progress)
+    results = measure_robustness(subject.stego, openers, scenes, seed=seed, share=share)
     names = [f"{role_of(index, len(scenes))}, dB" for index in range(len(scenes))]
     table = Table(("change", *names), tuple(map(_change_row, results)))
     numbers = {"changes": _builtins(results)}
@@ -323,9 +320,8 @@ def pruning_verdicts(results: Sequence[ChangeResult]) -> list[Verdict]:
     return verdicts
 
 
-def speed(subject: Subject, seed: int, progress: Progress) -> tuple[Section, Pictures]:
+def speed(subject: Subject, seed: int, share: Share) -> tuple[Section, Pictures]:
     """Rendering times of the stego model and of the revealed secrets."""
-    progress(0, 1)
     times = render_times(subject, subject.stego)
     names = ["published model", *(role_of(index, len(times)) for index in range(1, len(times)))]
     rows = [
@@ -355,7 +351,7 @@ class Part:
 
     title: str
     note: str  # what its numbers mean
-    measure: Callable[[Subject, int, Progress], tuple[Section, Pictures]]
+    measure: Callable[[Subject, int, Share], tuple[Section, Pictures]]
     work: Work
     only_3dgs: bool = True  # needs a published 3DGS model
 

@@ -38,11 +38,6 @@ class Work:
         return 0.1 + self.seconds + self.views * view_seconds + self.per_gaussian * gaussians
 
 
-def control_name(seed: int, digest: str) -> str:
-    """The name of a control's file; `digest` is of its inputs."""
-    return f"seed-{seed}-{digest}.ply"
-
-
 @dataclass
 class Subject:
     """A run, and data that its measures share; models on `device`."""
@@ -119,7 +114,7 @@ class Subject:
         """Fit a plain model of the cover, or read it from the run's folder."""
         cover = self.scenes[0]
         inputs = json.dumps({"scene": cover.digest(), "config": asdict(config)}, sort_keys=True)
-        name = control_name(config.known_seed, hashlib.sha256(inputs.encode()).hexdigest()[:12])
+        name = f"seed-{config.known_seed}-{hashlib.sha256(inputs.encode()).hexdigest()[:12]}.ply"
         model = f"{CONTROLS}/{name}"
         if (folder.path / model).exists():
             return read_model(folder.path / model)

@@ -24,8 +24,7 @@ class BaselineOptions(JointOptions):
     common_poses: Annotated[
         float,
         CommandLineOption(
-            "Share of steps that render both scenes from one pose, 0 to 1, as in KeySS.",
-            metavar="SHARE",
+            "Share of steps that render both scenes from one pose, 0 to 1, as in KeySS.", metavar="SHARE"
         ),
     ] = Design.common_poses
     network_rate: float = 5e-4  # AdamW; follows the length of the run like KeySS's
@@ -83,7 +82,6 @@ class DecoderOptions(BaselineOptions):
     """The Gaussians show the cover only, so they start from its points."""
 
     method: ClassVar[str] = "3dgs-decoder"
-
     points: ClassVar[Scenes] = "cover"
     step_cost: ClassVar[float] = 16.0
 
@@ -93,7 +91,6 @@ class GsHiderOptions(BaselineOptions):
     """See `BaselineOptions`."""
 
     method: ClassVar[str] = "gs-hider"
-
     step_cost: ClassVar[float] = 30.0
 
 
@@ -102,7 +99,6 @@ class WaterGsOptions(BaselineOptions):
     """See `BaselineOptions`."""
 
     method: ClassVar[str] = "watergs"
-
     step_cost: ClassVar[float] = 2.0
 
 
@@ -111,5 +107,4 @@ class ShOptions(BaselineOptions):
     """See `BaselineOptions`."""
 
     method: ClassVar[str] = "3dgs-sh"
-
     step_cost: ClassVar[float] = 2.0

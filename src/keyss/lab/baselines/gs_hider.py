@@ -75,7 +75,7 @@ def _open(companion: CompanionTensors) -> Show:
 
 METHOD = Baseline(
     options=GsHiderOptions,
-    capabilities=Capabilities(keys=False, standard=False, models=False),
+    capabilities=Capabilities(keys=False, standard=False),
     open=_open,
     training=GsHiderTraining,
 )

@@ -69,7 +69,7 @@ def _open(companion: CompanionTensors) -> Show:
 
 METHOD = Baseline(
     options=DecoderOptions,
-    capabilities=Capabilities(keys=False, models=False),
+    capabilities=Capabilities(keys=False),
     open=_open,
     training=DecoderTraining,
 )

@@ -44,9 +44,4 @@ def _open(companion: CompanionTensors) -> Show:
     return lambda stego: replace(stego, sh=sh)
 
 
-METHOD = Baseline(
-    options=ShOptions,
-    capabilities=Capabilities(keys=False),
-    open=_open,
-    training=ShTraining,
-)
+METHOD = Baseline(options=ShOptions, capabilities=Capabilities(keys=False), open=_open, training=ShTraining)

@@ -40,8 +40,4 @@ def _open(companion: CompanionTensors) -> Show:
     return lambda stego: model
 
 
-METHOD = BoundMethod(
-    options=BoundOptions,
-    capabilities=Capabilities(keys=False),
-    open=_open,
-)
+METHOD = BoundMethod(options=BoundOptions, capabilities=Capabilities(keys=False), open=_open)

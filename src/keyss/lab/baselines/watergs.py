@@ -129,8 +129,5 @@ def _open(companion: CompanionTensors) -> Show:
 
 
 METHOD = Baseline(
-    options=WaterGsOptions,
-    capabilities=Capabilities(keys=False),
-    open=_open,
-    training=WaterGsTraining,
+    options=WaterGsOptions, capabilities=Capabilities(keys=False), open=_open, training=WaterGsTraining
 )

@@ -19,7 +19,7 @@ from keyss.files import write_bytes
 from keyss.fitting import PRESETS, FitConfig
 from keyss.fitting.image_metrics import HOW_TO_GET
 from keyss.lab.audits.trial_measures import CONVERSIONS
-from keyss.lab.many.result_tables import TrialNumbers, write_scene_tables
+from keyss.lab.many.result_tables import write_scene_tables
 from keyss.lab.many.trial import opened_run
 from keyss.lab.many.trial_folder import Forecast, Outcome, TrialFolder
 from keyss.measure.renders import contact_sheet, renders_of
@@ -162,18 +162,12 @@ def compare(
     outcomes = folder.run(reporter=reporter)
     arguments = {"cover": scenes[0], "secret": scenes[1], "iterations": fit.iterations}
     arguments |= {"max_gaussians": fit.max_gaussians, "width": width, "seeds": list(seeds)}
-    rows = [_row(name, [outcomes[places[name, seed]] for seed in seeds], folder) for name in chosen]
+    rows = [_row(name, [outcomes[places[name, seed]] for seed in seeds]) for name in chosen]
     comparison = Comparison(arguments=arguments, methods=tuple(rows))
     write_record(folder.out / f"{STEM}.json", comparison)
-    names = [os.path.basename(scene) for scene in scenes]
-    done = {trial: outcomes[place] for trial, place in places.items() if outcomes[place].result}
-    numbers = [TrialNumbers({"method": name}, names, seed, outcome) for (name, seed), outcome in done.items()]
-    write_scene_tables(folder.out, STEM, numbers)
-    runs = {
-        name: opened_run(folder.trials[outcome.folder], outcome.folder)
-        for (name, seed), outcome in done.items()
-        if seed == seeds[0]
-    }
+    write_scene_tables(folder.out, STEM, outcomes.values())
+    first = {name: outcomes[places[name, seeds[0]]] for name in chosen}
+    runs = {name: opened_run(each.trial, each.folder) for name, each in first.items() if each.result}
     if runs:
         write_bytes(folder.out / f"{STEM}.png", comparison_sheet(runs, device))
     return comparison
@@ -205,7 +199,8 @@ def _add(
         )
         for scene, count, config in zip(scenes, steps, options.fits(2), strict=True)
     ]
-    return folder.hiding(name, scenes, options, models, measures=MEASURES, controls=controls)
+    labels = {"method": name}
+    return folder.hiding(name, scenes, options, models, labels=labels, measures=MEASURES, controls=controls)
 
 
 def _parse_method(text: str, device: str) -> MethodOptions:
@@ -218,10 +213,10 @@ def _parse_method(text: str, device: str) -> MethodOptions:
     return variants[kind] if kind in variants else method.options.preset(kind or "default", device)
 
 
-def _row(name: str, outcomes: Sequence[Outcome], folder: TrialFolder) -> ComparedMethod:
+def _row(name: str, outcomes: Sequence[Outcome]) -> ComparedMethod:
     """The means of the numbers that all seeds have."""
-    method = registry.get(folder.trials[outcomes[0].folder].method)
-    row = ComparedMethod(name=name, keys=method.capabilities.keys)
+    keys = registry.get(outcomes[0].trial.method).capabilities.keys
+    row = ComparedMethod(name=name, keys=keys)
     results = [outcome.result for outcome in outcomes if outcome.result is not None]
     if len(results) < len(outcomes):
         return replace(row, error=next(outcome.error for outcome in outcomes if outcome.error))

@@ -19,8 +19,8 @@ import msgspec
 from keyss._version import __version__
 from keyss.core import UsageError, ViewOptions
 from keyss.core.errors import did_you_mean
-from keyss.lab.many.option_changes import with_changes
-from keyss.lab.many.result_tables import TrialNumbers, write_scene_tables
+from keyss.lab.many.result_tables import write_scene_tables
+from keyss.lab.many.sweep_spec import with_changes
 from keyss.lab.many.trial_folder import Forecast, TrialFolder
 from keyss.methods import registry
 from keyss.progress import Reporter
@@ -161,7 +161,6 @@ def reproduce(
     changes: dict[str, Any] = {"ssim_weight": SSIM_WEIGHT}
     changes |= {name: sizes[name] for name in ("iterations", "max_gaussians") if sizes[name] is not None}
     folder = TrialFolder(Path(out), common={"views": ViewOptions(sizes["width"]), "device": device})
-    places: dict[Path, tuple[str, Group, int]] = {}
     for group, (name, run), seed in product(groups, spec.runs.items(), seeds):
         preset = registry.get(run.method).options.preset("full")
         options = with_changes(preset, run.changes).with_fit(**changes, seed=seed)
@@ -171,17 +170,16 @@ def reproduce(
         note = f"seed {seed}" * (len(seeds) > 1)
         models = [folder.plain(*fit, note) for fit in zip(sources, fits, strict=True)]
         title = f"{name}, {'-'.join(group)}{note and f', {note}'}"
-        places[folder.hiding(title, sources, options, models, measures=spec.measures)] = name, shown, seed
+        labels = {"run": name, "pair": "-".join(shown)}
+        folder.hiding(title, sources, options, models, labels=labels, measures=spec.measures)
     if dry_run:
         return folder.forecast(reporter)
     outcomes = folder.run(reporter=reporter)
     numbers: dict[str, list[dict[str, float]]] = {name: [] for name in spec.runs}
-    rows = []
-    for place, (name, shown, seed) in places.items():
-        if (result := outcomes[place].result) is not None:
-            numbers[name].append(_numbers(result.numbers))
-            labels = {"run": name, "pair": "-".join(shown)}
-            rows.append(TrialNumbers(labels, shown, seed, outcomes[place]))
+    hidings = [outcome for outcome in outcomes.values() if outcome.trial.secrets]
+    for outcome in hidings:
+        if outcome.result is not None:
+            numbers[outcome.trial.labels["run"]].append(_numbers(outcome.result.numbers))
     covers = [cover for cover, *_ in groups] if full else []
     figures = figure_rows(spec, numbers, len(groups) * len(seeds), covers)
     measured = {row.label: row.here for row in figures}
@@ -192,11 +190,12 @@ def reproduce(
         pairs=tuple("-".join(group) for group in groups),
         rows=figures,
         claims=tuple(judge_claim(claim, measured) for claim in spec.claims),
-        failures={outcome.name: outcome.error for outcome in outcomes.values() if outcome.error},
+        failures={outcome.trial.name: outcome.error for outcome in outcomes.values() if outcome.error},
     )
     write_record(folder.out / f"{table}.json", reproduction)
     order = list(spec.runs)
-    write_scene_tables(folder.out, table, sorted(rows, key=lambda row: order.index(row.labels["run"])))
+    hidings.sort(key=lambda outcome: order.index(outcome.trial.labels["run"]))
+    write_scene_tables(folder.out, table, hidings)
     return reproduction
 
 

@@ -6,15 +6,15 @@ import csv
 import io
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
 from keyss.files import write_bytes
 from keyss.lab.many.trial_folder import Outcome
+
+Group = tuple[dict[str, str], list[Outcome]]  # labels, and the trials that have them
 
 # Decimals and heads of the usual metrics.
 _METRICS = {
@@ -27,44 +27,29 @@ _LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasci
 _LATEX |= {character: f"\\{character}" for character in "&%$#_{}"}
 
 
-@dataclass(frozen=True)
-class TrialNumbers:
-    """A finished trial, and its columns in tables."""
-
-    labels: Mapping[str, Any]  # the columns that name it, except the seed
-    scenes: Sequence[str]  # names of the cover and the secrets
-    seed: int
-    outcome: Outcome
-
-    @cached_property
-    def numbers(self) -> dict[str, float]:
-        """What was measured, without times and arguments."""
-        assert self.outcome.result is not None
-        every = self.outcome.result.numbers.items()
-        return {name: value for name, value in every if _NO_MEASURES.isdisjoint(name.split("."))}
-
-
-def summaries(trials: Sequence[TrialNumbers]) -> list[dict[str, Any]]:
+def summaries(outcomes: Iterable[Outcome]) -> list[dict[str, Any]]:
     """Rows of means and standard deviations over seeds, in the order of trials, then by measure."""
     rows = []
-    for labels, group in _group(trials):
-        for measure in sorted({name for trial in group for name in trial.numbers}):
-            values = [trial.numbers[measure] for trial in group if measure in trial.numbers]
+    for labels, group in _group(outcomes):
+        every = [_numbers(outcome) for outcome in group]
+        for measure in sorted({name for numbers in every for name in numbers}):
+            values = [numbers[measure] for numbers in every if measure in numbers]
             mean, std = mean_and_std(values)
             rows.append({**labels, "measure": measure, "seeds": len(values), "mean": mean, "std": std})
     return rows
 
 
-def scene_rows(trials: Sequence[TrialNumbers]) -> list[dict[str, Any]]:
+def scene_rows(outcomes: Iterable[Outcome]) -> list[dict[str, Any]]:
     """Rows of PSNR in dB, SSIM and LPIPS per scene: means and standard deviations over seeds."""
     rows = []
-    for labels, group in _group(trials):
-        for index, scene in enumerate(group[0].scenes):
+    for labels, group in _group(outcomes):
+        every = [_numbers(outcome) for outcome in group]
+        for index, scene in enumerate(group[0].trial.scenes):
             part, role = (f"secrets.{index}", "secret") if index else ("cover", "cover")
             row = {**labels, "scene": scene, "role": role, "seeds": len(group)}
             for metric in _METRICS:
                 name = f"{part}.{metric}"
-                values = [trial.numbers[name] for trial in group if name in trial.numbers]
+                values = [numbers[name] for numbers in every if name in numbers]
                 row[metric], row[f"{metric}_std"] = mean_and_std(values)
             rows.append(row)
     return rows
@@ -76,34 +61,41 @@ def mean_and_std(values: Sequence[float]) -> tuple[float, float]:
     return mean, stdev(values) if len(values) > 1 else math.nan
 
 
-def _group(trials: Sequence[TrialNumbers]) -> list[tuple[dict[str, str], list[TrialNumbers]]]:
-    """Group trials by labels, in their order; missing labels are empty."""
-    blank = dict.fromkeys((name for trial in trials for name in trial.labels), "")
-    groups: dict[str, tuple[dict[str, str], list[TrialNumbers]]] = {}
-    for trial in trials:
-        labels = blank | {name: _text(value) for name, value in trial.labels.items()}
-        groups.setdefault(json.dumps(labels), (labels, []))[1].append(trial)
+def _group(outcomes: Iterable[Outcome]) -> list[Group]:
+    """Group finished hidings by labels, in their order; missing labels are empty."""
+    done = [outcome for outcome in outcomes if outcome.trial.secrets and outcome.result]
+    blank = dict.fromkeys((name for outcome in done for name in outcome.trial.labels), "")
+    groups: dict[str, Group] = {}
+    for outcome in done:
+        labels = blank | {name: _text(value) for name, value in outcome.trial.labels.items()}
+        groups.setdefault(json.dumps(labels), (labels, []))[1].append(outcome)
     return list(groups.values())
 
 
-def write_scene_tables(out: Path, stem: str, trials: Sequence[TrialNumbers]) -> None:
+def _numbers(outcome: Outcome) -> dict[str, float]:
+    """What was measured, without times and arguments."""
+    every = outcome.result.numbers.items() if outcome.result else ()
+    return {name: value for name, value in every if _NO_MEASURES.isdisjoint(name.split("."))}
+
+
+def write_scene_tables(out: Path, stem: str, outcomes: Iterable[Outcome]) -> None:
     """Write `scene_rows` to `STEM.csv` and `STEM.tex`. Raises OutputError."""
-    rows = scene_rows(trials)
+    rows = scene_rows(outcomes)
     write_bytes(out / f"{stem}.csv", csv_bytes(rows))
     write_bytes(out / f"{stem}.tex", latex(rows).encode())
 
 
-def write_sweep_tables(out: Path, trials: Sequence[TrialNumbers]) -> None:
+def write_sweep_tables(out: Path, outcomes: Collection[Outcome]) -> None:
     """Write `results.csv` and `trials.csv` with all measures, and `scenes`. Raises OutputError."""
     rows = [
-        {**labels, "seed": trial.seed, "trial": trial.outcome.folder.name, "measure": measure, "value": value}
-        for labels, group in _group(trials)
-        for trial in group
-        for measure, value in sorted(trial.numbers.items())
+        {**labels, "seed": each.trial.fit.seed, "trial": each.folder.name, "measure": name, "value": value}
+        for labels, group in _group(outcomes)
+        for each in group
+        for name, value in sorted(_numbers(each).items())
     ]
-    write_bytes(out / "results.csv", csv_bytes(summaries(trials)))
+    write_bytes(out / "results.csv", csv_bytes(summaries(outcomes)))
     write_bytes(out / "trials.csv", csv_bytes(rows))
-    write_scene_tables(out, "scenes", trials)
+    write_scene_tables(out, "scenes", outcomes)
 
 
 def latex(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -6,7 +6,8 @@ Names of fields, types, options of methods and the existence of files are checke
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,15 +15,15 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from keyss.core import InputError, KeyssError, ViewOptions, import_extra
+from keyss.core import InputError, KeyssError, UsageError, ViewOptions, import_extra
+from keyss.core.errors import did_you_mean
 from keyss.files.inputs import read_text
-from keyss.fitting import PRESETS
+from keyss.fitting import PRESETS, FitConfig
 from keyss.fitting.config import MAX_SEED
 from keyss.lab.audits import PARTS
-from keyss.lab.many.option_changes import with_changes
-from keyss.lab.many.result_tables import TrialNumbers, write_sweep_tables
+from keyss.lab.many.result_tables import write_sweep_tables
 from keyss.lab.many.trial_folder import Forecast, Outcome, TrialFolder
-from keyss.methods import MethodOptions, registry
+from keyss.methods import Design, KeyssOptions, MethodOptions, registry
 from keyss.progress import Reporter
 from keyss.rendering import resolve_device
 from keyss.rendering.orbit import is_model
@@ -108,6 +109,30 @@ def variants(path: Path, spec: SweepSpec) -> Iterator[tuple[str, MethodOptions, 
             yield str(entry.name), options, choices
 
 
+def with_changes(preset: MethodOptions, changes: Mapping[str, Any]) -> MethodOptions:
+    """The preset with options changed by name: `publish`, `fit.iterations`, `design.points` (of KeySS).
+
+    Raises UsageError for unknown names, and it or msgspec.ValidationError for wrong values.
+    """
+    kinds: dict[str, Any] = {"": type(preset), "fit": FitConfig}
+    if isinstance(preset, KeyssOptions):
+        kinds["design"] = Design
+    known = {f"{kind}.{option.name}".lstrip(".") for kind in kinds for option in fields(kinds[kind])}
+    known -= {"fit", "fit.seed"}
+    parts: dict[str, dict[str, Any]] = {kind: {} for kind in kinds}
+    for name, value in changes.items():
+        if name not in known:
+            raise UsageError(f"option {name[:60]!r} is unknown; {did_you_mean(name, known)}")
+        prefix, _, field = name.rpartition(".")
+        parts[prefix][field] = value
+    options = msgspec.convert({**msgspec.to_builtins(preset), **parts[""]}, type(preset))
+    if isinstance(options, KeyssOptions) and parts["design"]:
+        design = {**msgspec.to_builtins(options.configuration), **parts["design"]}
+        options = replace(options, design=msgspec.convert(design, Design))
+    fit = msgspec.convert({**msgspec.to_builtins(options.fit), **parts["fit"]}, FitConfig)
+    return options.with_fit(**{name: getattr(fit, name) for name in parts["fit"]})
+
+
 def _resolve_pair(path: Path, index: int, pair: Pair, most: int) -> Pair:
     """Make paths absolute. Raises InputError for missing files, and for more secrets than `most`."""
     where = f"{path}: pairs[{index}]"
@@ -155,7 +180,6 @@ def sweep(
     common = {name: getattr(spec_, name) for name in ("min_psnr", "bound", "device")}
     common["views"] = ViewOptions(spec_.width, spec_.background, spec_.skip_missing)
     folder = TrialFolder(Path(out), common)
-    rows: dict[Path, tuple[dict[str, Any], list[str], int]] = {}  # labels, scenes and seed
     for pair, (method, preset, choices), seed in product(spec_.pairs, variants(path, spec_), spec_.seeds):
         options = preset.with_fit(seed=seed)
         sources = [pair.cover, *pair.secrets]
@@ -166,12 +190,10 @@ def sweep(
         ]
         chosen = "".join(f" {name}={value}" for name, value in choices.items())
         name = f"{pair.name} {method}{chosen} seed {seed}"
-        place = folder.hiding(name, sources, options, models, measures=spec_.evaluate)
         labels = {"pair": pair.name, "method": method, **choices}
-        rows.setdefault(place, (labels, [Path(source).stem for source in sources], seed))
+        folder.hiding(name, sources, options, models, labels=labels, measures=spec_.evaluate)
     if dry_run:
         return folder.forecast(reporter)
     outcomes = folder.run(ray=ray, cores=cores, reporter=reporter)
-    done = [TrialNumbers(*row, outcomes[place]) for place, row in rows.items() if outcomes[place].result]
-    write_sweep_tables(folder.out, done)
-    return tuple(outcomes[place] for place in rows)
+    write_sweep_tables(folder.out, outcomes.values())
+    return tuple(outcome for outcome in outcomes.values() if outcome.trial.secrets)

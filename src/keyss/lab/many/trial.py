@@ -53,6 +53,7 @@ class Trial:
 
     keyss: str = __version__
     name: str  # display name
+    labels: dict[str, Any] = field(default_factory=dict)  # columns that name it in tables, beside its seed
     cover: str  # a scene, or a model
     secrets: tuple[str, ...] = ()
     models: tuple[str | None, ...] = ()  # plain models of the cover and of each secret
@@ -68,11 +69,22 @@ class Trial:
     @property
     def identity(self) -> str:
         """SHA-256 (hexadecimal) of all that the run depends on: not of its measures."""
-        same = replace(self, name="", measures=())
+        same = replace(self, name="", labels={}, measures=())
         models = [path for path in self.models if path and os.path.isabs(path)]
         inputs = [self.cover, *self.secrets, *models]
         times = {path: os.stat(path).st_mtime_ns if os.path.exists(path) else 0 for path in inputs}
         return hashlib.sha256(record_bytes(same) + msgspec.json.encode(times)).hexdigest()
+
+    @property
+    def scenes(self) -> list[str]:
+        """Names of the cover and the secrets."""
+        paths = map(Path, (self.cover, *self.secrets))
+        return [path.name if path.is_dir() else path.stem for path in paths]
+
+    @property
+    def fit(self) -> FitConfig:
+        """The settings of its training."""
+        return self.options if isinstance(self.options, FitConfig) else self.options.fit
 
     @property
     def needs(self) -> list[str]:
@@ -219,12 +231,9 @@ def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -
     """Numbers of measures, or notes on them."""
     numbers: dict[str, float | str] = {}
     if parts := [name for name in names if name in PARTS]:
-        run = folder / RUN
-        manifest = read_manifest(run)
-        done = "audit" in manifest.files
-        resume = not done and manifest.running is not None
-        more: dict[str, Any] = {"device": trial.device, "overwrite": done, "resume": resume}
-        audited = audit(run, keys_of(trial, folder), only=parts, reporter=reporter, **more)
+        keys, done = keys_of(trial, folder), "audit" in read_manifest(folder / RUN).files
+        more: dict[str, Any] = {"device": trial.device, "overwrite": done, "reporter": reporter}
+        audited = audit(folder / RUN, keys, only=parts, **more)
         for part in parts:
             numbers |= flat(audited.sections[part].numbers, f"audit.{part}")
     if others := [name for name in names if name not in PARTS]:

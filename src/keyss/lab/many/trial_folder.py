@@ -37,7 +37,7 @@ _SCENES, _READ_SECONDS = 3, 2.0  # scenes of photos that a forecast keeps in mem
 class Outcome:
     """The outcome of a trial."""
 
-    name: str
+    trial: Trial
     folder: Path
     result: Result | None = None
     error: str | None = None  # the reason for a missing result
@@ -78,6 +78,7 @@ class TrialFolder:
         options: MethodOptions,
         models: Sequence[str | None],
         *,
+        labels: Mapping[str, Any],
         measures: tuple[str, ...] = (),
         controls: Sequence[str] = (),
     ) -> Path:
@@ -88,6 +89,7 @@ class TrialFolder:
         check_extras(measures)
         trial = Trial(
             name=name,
+            labels=dict(labels),
             cover=sources[0],
             secrets=tuple(sources[1:]),
             models=tuple(models),
@@ -120,7 +122,7 @@ class TrialFolder:
             if not (self.out / MASTER_KEY).exists():
                 write_bytes(self.out / MASTER_KEY, f"{generate_key(LONG_KEY_LENGTH)}\n".encode())
             outcome_of = {
-                folder: Outcome(trial.name, folder, result, skipped=True)
+                folder: Outcome(trial, folder, result, skipped=True)
                 for folder, trial in self.trials.items()
                 if (result := finished_result(trial, folder)) is not None
             }
@@ -128,7 +130,7 @@ class TrialFolder:
             outcomes = _in_process(due, reporter) if ray is None or not due else _on_ray(due, ray, cores)
             for number, outcome in enumerate(outcomes, start=1):
                 state = "failed" if outcome.error else "done"
-                reporter.note(f"[{number}/{len(due)}] {outcome.name}: {state}")
+                reporter.note(f"[{number}/{len(due)}] {outcome.trial.name}: {state}")
                 outcome_of[outcome.folder] = outcome
         return {folder: outcome_of[folder] for folder in self.trials}
 
@@ -186,7 +188,7 @@ def _needed(trial: Trial, folder: Path, started: Mapping[Path, Any]) -> list[Any
 
 def _attempt(trial: Trial, folder: Path, reporter: Reporter | None, *needed: Outcome) -> Outcome:
     """Run one trial; an error becomes a part of its outcome."""
-    outcome = Outcome(trial.name, folder)
+    outcome = Outcome(trial, folder)
     if failed := [outcome.error for outcome in needed if outcome.error]:
         return replace(outcome, error=failed[0])
     try:
@@ -223,6 +225,6 @@ def _on_ray(trials: Mapping[Path, Trial], address: str, cores: int) -> Iterator[
                 yield replace(ray.get(done), folder=folder)
             except ray.exceptions.RayError as error:
                 reason = f"lost by Ray: {str(error).strip().splitlines()[0]}"
-                yield Outcome(trials[folder].name, folder, error=reason)
+                yield Outcome(trials[folder], folder, error=reason)
     finally:
         ray.shutdown()

@@ -36,7 +36,6 @@ class Change:
     strength: float
     sentence: str  # what it does, for the report
     apply: Callable[[Gaussians], Gaussians]
-    steps: int = 0  # of training
 
     def __call__(self, model: Gaussians) -> Gaussians:
         return self.apply(model)
@@ -133,7 +132,7 @@ def fine_tuning(cover: Scene, steps: int = 500, seed: int = 0) -> Change:
     """Continue training on the cover's photos, as plain 3DGS without density control."""
     sentence = f"Training continues on the cover's photos for {steps} steps."
     apply = partial(fine_tune, scene=cover, steps=steps, seed=seed)
-    return Change("fine-tuning", steps, sentence, apply, steps)
+    return Change("fine-tuning", steps, sentence, apply)
 
 
 def purification(cover: Scene, given_up: float = 0.0, steps: int = 300, seed: int = 0) -> Change:
@@ -155,7 +154,7 @@ def purification(cover: Scene, given_up: float = 0.0, steps: int = 300, seed: in
         f"{f', giving up {given_up:.1%} of what those show' if given_up else ''}; "
         f"then training continues for {steps} steps."
     )
-    return Change("purification", given_up, sentence, apply, steps)
+    return Change("purification", given_up, sentence, apply)
 
 
 def fine_tune(model: Gaussians, scene: Scene, steps: int, seed: int = 0) -> Gaussians:

@@ -15,10 +15,10 @@ from keyss.lab.robustness.changes import Change
 from keyss.lab.robustness.converters import converters
 from keyss.measure.hide_quality import in_cover
 from keyss.methods.hidden import HiddenScene
+from keyss.progress import Share
 
 PRUNED = (0.05, 0.10, 0.15, 0.25, 0.50)
 NOISE = (0.001, 0.01, 0.1)
-_STEPS_TO_MEASURE = 100  # training steps that take as long as measuring a change
 SEEDS = 3  # repetitions per random removal; results vary by a dB or two
 
 # Opens a secret in a stego model on the CPU; raises KeyssError if it does not open.
@@ -74,14 +74,14 @@ def measure_robustness(
     changes: Sequence[Change] | None = None,
     max_views: int = 8,
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    share: Share | None = None,
 ) -> list[ChangeResult]:
     """PSNRs of cover and secrets after each of the `changes`; the first result is the unchanged model's.
 
     `changes`: by default `default_changes`, about 50; results of equal attack and strength are averaged.
-    `max_views`: test views per scene. `progress`: called with the finished and the total work in training
-    steps. Renders on the device of `stego`. Deterministic in `seed`. Raises UsageError unless there is one
-    opener per secret, KeyssError if a secret does not open in the unchanged model.
+    `max_views`: test views per scene. `share`: called with the share of the work that is done. Renders on the
+    device of `stego`. Deterministic in `seed`. Raises UsageError unless there is one opener per secret,
+    KeyssError if a secret does not open in the unchanged model.
     """
     cover, *secrets = scenes
     if len(openers) != len(secrets):
@@ -105,11 +105,9 @@ def measure_robustness(
     results: dict[tuple[str, float], list[ChangeResult]] = {}
     before: list[float] = []
     unchanged = Change("none", 0, "Nothing is changed.", lambda model: model)
-    done, work = 0, sum(_STEPS_TO_MEASURE + alteration.steps for alteration in [unchanged, *changes])
-    for alteration in [unchanged, *changes]:
-        if progress is not None:
-            progress(done, work)
-        done += _STEPS_TO_MEASURE + alteration.steps
+    for index, alteration in enumerate([unchanged, *changes]):
+        if share is not None:
+            share(index / (1 + len(changes)))
         result = ChangeResult(alteration.attack, alteration.strength, alteration.sentence)
         try:
             changed = alteration(stego)

@@ -38,10 +38,6 @@ class SecretSize:
         return SecretSize(fit.max_gaussians, usual, finest, fit.sh_degree, None)
 
     @property
-    def fitted(self) -> bool:
-        return self.model is not None
-
-    @property
     def flat(self) -> int:
         """Like `usual`, at SH degree 0; takes as long again for large models."""
         if self.model is None:
@@ -113,9 +109,3 @@ class CarryCapacity:
         self.payloads.warn_of_sharing(needed)
         limits = self.payloads.limits(needed)
         return [prune_to_size(*model) for model in zip(models, limits, viewpoints, strict=True)]
-
-    def appended(self, secrets: Sequence[SecretSize]) -> int:
-        """Approximate number of Gaussians by which the model grows."""
-        if not self.payloads.grows:
-            return 0
-        return APPENDED.appended_count([secret.usual for secret in secrets])

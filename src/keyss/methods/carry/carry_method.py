@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
-from keyss.channels import Channel, Payload, PreparedCover, open_payload
+from keyss.channels import APPENDED, Channel, Payload, PreparedCover, open_payload
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.schedule import boost_of
@@ -107,9 +106,9 @@ class CarryMethod:
             chosen_by_user = options.publish or options.format
             for size, count in zip(secret_sizes, counts, strict=True):
                 hopeless = count < min(_HOPELESS, _HOPELESS_SHARE * size.count)
-                known = cover.given is not None and size.fitted
+                known = cover.given is not None and size.model is not None
                 if hopeless or (known and not chosen_by_user and count < _MIN_SHARE * size.count):
-                    most = "" if size.fitted else "up to "
+                    most = "" if size.model else "up to "
                     raise UsageError(
                         f"a secret of {most}{size.count:,} Gaussians would be cut down to about {count:,}"
                     )
@@ -127,7 +126,8 @@ class CarryMethod:
                 zip(training, options.fits(len(sources)), strict=True)
             )
         ]
-        appended = capacity.appended(secret_sizes)
+        usual = [size.usual for size in secret_sizes]
+        appended = APPENDED.appended_count(usual) if capacity.payloads.grows else 0  # about
         prunes = any(count < size.count for count, size in zip(counts, secret_sizes, strict=True))
         kept, flat = (
             sum(
@@ -171,19 +171,22 @@ class CarryMethod:
         if prepared.trains:
             fitting = capacity.prune(models, viewpoints)
             for index, secret in enumerate(secrets):
-                if steps := prepared.training[index + 1].steps:
-                    kept = fitting[index]
-                    models[index] = fine_tune(
-                        secret.model.with_sh_degree(kept.sh_degree),
-                        secret.scene,
-                        max(1, int(_FINE_TUNED_SHARE * len(kept)))
-                        if len(kept) < before[index]
-                        else len(kept),
-                        replace(prepared.options.fit, iterations=steps),
-                        context,
-                        photos=secret.photos,
-                        name=role_of(index + 1, len(before) + 1),
-                    )
+                if not (steps := prepared.training[index + 1].steps):
+                    continue
+                size, role = len(fitting[index]), role_of(index + 1, len(before) + 1)
+                size = max(1, int(_FINE_TUNED_SHARE * size)) if size < before[index] else size
+                model = secret.model.with_sh_degree(fitting[index].sh_degree)
+                fit = prepared.options.fit
+                models[index] = fit_scene(
+                    secret.scene,
+                    # Fine-tuning must not depend on the other secrets.
+                    replace(fit, iterations=steps, seed=fit.seed_of(role)),
+                    model=most_contributing(model, secret.scene, size),
+                    rate=boost_of(replace(fit, iterations=steps)) if secret.photos else _MODEL_RATE,
+                    device=context.device,
+                    title=f"fine-tuning of {role_phrase(role)}",
+                    **context.loop_arguments(role.replace(" ", "-")),
+                ).gaussians
             del fitting
         del secrets
         seconds = seconds_to_hide(len(cover.model), [*map(len, models)], prepared.grows)
@@ -223,32 +226,6 @@ def _note(capacity: CarryCapacity, appended: int) -> str:
 
 
 METHOD = CarryMethod()
-
-
-def fine_tune(
-    secret: Gaussians,
-    scene: Scene,
-    count: int,
-    fit: FitConfig,
-    context: Context,
-    *,
-    photos: bool,
-    name: str,
-) -> Gaussians:
-    """Train the `most_contributing` Gaussians of `secret` further.
-
-    Raises Interrupted on Ctrl-C, InputError for a checkpoint of another run.
-    """
-    return fit_scene(
-        scene,
-        # Fine-tuning must not depend on the other secrets.
-        replace(fit, seed=fit.seed_of(name)),
-        model=most_contributing(secret, scene, count),
-        rate=boost_of(fit) if photos else _MODEL_RATE,
-        device=context.device,
-        title=f"fine-tuning of {role_phrase(name)}",
-        **context.loop_arguments(name.replace(" ", "-")),
-    ).gaussians
 
 
 def most_contributing(plain: Gaussians, scene: Scene, count: int) -> Gaussians:

@@ -32,11 +32,6 @@ class CarryOptions(MethodOptions):
         None  # steps of fine-tuning; None: FINE_TUNING per step of `fit`, fewer without photos
     )
 
-    @property
-    def may_train(self) -> bool:
-        """True unless fine-tuning is excluded."""
-        return self.fine_tune != "never"
-
     def fits(self, scenes: int) -> list[FitConfig]:
         """See `MethodOptions`. Secrets by default train for the steps of fine-tuning in addition."""
         if self.iterations is not None:

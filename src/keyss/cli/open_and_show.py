@@ -1,4 +1,4 @@
-"""The commands that show and measure models: `view`, `render`, `info` and `evaluate`."""
+"""The commands that open, show and measure published models."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from keyss.cli.arguments import (
     PHOTOS,
     Device,
     KeyFiles,
+    KeyFilesToCheck,
+    OneKeyFile,
     Overwrite,
     Photos,
     Run,
@@ -19,12 +21,96 @@ from keyss.cli.arguments import (
     optional,
     switch,
     verb,
+    waiting_for,
 )
-from keyss.cli.keys import keys_of_run
-from keyss.core.errors import UsageError
+from keyss.cli.keys import given_keys, keys, keys_of_run
+from keyss.core.errors import InputError, UsageError
+from keyss.files.atomic import check_not_an_input, check_output_file
+from keyss.files.inputs import is_standard
 
 _VECTOR = r"[-+.\de]+(,[-+.\de]+){2}"
 _POSE = rf"#?eye={_VECTOR}&target={_VECTOR}(&up=({_VECTOR}|-?[xyz]))?(&fov=[\d.]+,[\d.]+)?"
+
+
+def reveal(
+    stego: Annotated[Positional[Path], arg(metavar="FILE", help="Published model, or - for stdin.")],
+    *,
+    key_file: OneKeyFile = (),
+    out: Annotated[
+        Path,
+        arg(
+            aliases=["-o"],
+            metavar="FILE",
+            help="Model to write (.ply, .spz, ...), or - for stdout; any other name for a hidden file.",
+        ),
+    ],
+    companion: Annotated[
+        Path | None, optional("FILE", "Companion file of the model, for methods that need one.")
+    ] = None,
+    frame: Annotated[
+        Literal["secret", "cover"], arg(help="Coordinates: the secret's own, or those it was hidden in.")
+    ] = "secret",
+    overwrite: Overwrite = False,
+    device: Device = "auto",
+) -> None:
+    """Reveal the secret that a key opens.
+
+    example: keyss reveal runs/hidden/publish/model.ply --key-file key.txt -o revealed.ply
+
+    example: keyss reveal - --key-file key.txt -o - < model.ply > revealed.ply
+    """
+    check_exists(stego, companion, keys=key_file)
+    if not is_standard(out):  # before a key is asked for and torch is imported
+        check_not_an_input(out, [stego])
+        check_output_file(out, overwrite)
+    import keyss
+
+    key: str | None = None
+    if companion is None or key_file:
+        (key,) = keys(key_file, 1)
+    from keyss.cli.tables import print_written
+
+    with waiting_for("reveal", "opening", stego):
+        revealed = keyss.reveal(
+            stego,
+            key,
+            companion=companion,
+            frame=frame,
+            device=device,
+            out=out,
+            overwrite=overwrite,
+        )
+    if revealed.file is not None:
+        print_written(out, f"{revealed.file.name!r}, {len(revealed.file.data):,} bytes")
+        return
+    recovered = revealed.recovered
+    of = f" of {recovered.hidden:,}" if recovered.hidden else ""
+    print_written(out, f"{recovered.found:,}{of} Gaussians")
+
+
+def verify(
+    model: Annotated[Positional[Path], arg(metavar="FILE", help="Model (.ply, .spz, ...), or - for stdin.")],
+    *,
+    key_file: KeyFilesToCheck = (),
+    json_: Annotated[bool, switch("Print JSON.", name="json")] = False,
+    device: Device = "auto",
+) -> None:
+    """Check that a model is sound and, with a key, that its secret is complete.
+
+    Exit status: 0 sound and as published, 3 the key opens nothing, 4 not sound, changed or not complete.
+
+    example: keyss verify model.ply --key-file key.txt
+    """
+    check_exists(model, keys=key_file)
+    import keyss
+    from keyss.cli.tables import print_json, print_verification
+
+    given = given_keys(key_file)
+    with waiting_for("reveal" if given else "verify", "checking", model):
+        checked = keyss.verify(model, given, device=device)
+    (print_json if json_ else print_verification)(checked)
+    if checked.problems:
+        raise InputError(f"{model}: {'; '.join(checked.problems)}")
 
 
 def view(
@@ -68,8 +154,6 @@ def view(
     """
     check_exists(model)
     from keyss.cli.tables import print_written
-    from keyss.progress import waiting
-    from keyss.runs.estimates import seconds_for
 
     if pose and not re.fullmatch(_POSE, pose):
         raise UsageError(f"--pose: expected eye=X,Y,Z&target=X,Y,Z as in the page's address, got {pose}")
@@ -78,7 +162,7 @@ def view(
     if out is not None:
         if port or host != "127.0.0.1":
             raise UsageError("--port and --host are for serving: leave them out with -o")
-        with waiting(f"writing {out.name}", seconds_for("export", model)):
+        with waiting_for("export", "exporting", model):
             from keyss.viewer import export_html
 
             written = export_html(model, out, look=_look(model, changed), overwrite=overwrite)
@@ -90,7 +174,7 @@ def view(
         raise UsageError("--overwrite, --allow-host and --embed-in are for -o: leave them out")
     if not 0 <= port < 1 << 16:
         raise UsageError(f"--port: expected 0 to {(1 << 16) - 1}, got {port}")
-    with waiting(f"reading {model.name}", seconds_for("export", model)):
+    with waiting_for("export", "reading", model):
         from keyss.viewer import ModelServer
 
         server = ModelServer(model, host, port, _look(model, changed))
@@ -133,10 +217,8 @@ def render(
     check_exists(model, cameras)
     import keyss
     from keyss.cli.tables import print_written
-    from keyss.progress import waiting
-    from keyss.runs.estimates import seconds_for
 
-    with waiting(f"rendering {model.name}", seconds_for("render", model)):
+    with waiting_for("render", "rendering", model):
         images = keyss.render(
             model, cameras, split=split, views=photos.views(), device=device, out=out, overwrite=overwrite
         )
@@ -162,11 +244,9 @@ def info(
     example: keyss info runs/hidden/publish/model.ply
     """
     from keyss.cli.tables import print_info, print_json
-    from keyss.progress import waiting
     from keyss.runs.describe import info as describe
-    from keyss.runs.estimates import seconds_for
 
-    with waiting(f"reading {path.name}", seconds_for("info --capacity" if capacity else "info", path)):
+    with waiting_for("info --capacity" if capacity else "info", "reading", path):
         described = describe(path, capacity=capacity)
     (print_json if json_ else print_info)(described)
 
