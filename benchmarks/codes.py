@@ -19,7 +19,7 @@ import os
 import time
 from pathlib import Path
 
-from keyss.channels import SUFFIXES, Payload, QuantisedChannel, QuantisedReader
+from keyss.channels import SUFFIXES, Payload, QuantisedReader, quantised_channel
 from keyss.channels.lsb.fields import FORMATS
 from keyss.core import Gaussians, Scene
 from keyss.files.formats.common import in_morton_order
@@ -60,7 +60,7 @@ def print_rows(cover: tuple[str, Gaussians], secret: tuple[str, Gaussians], data
         model = in_morton_order(cover[1])
         untouched = format_.quantise(model).dequantise()
         start = time.monotonic()
-        prepared = QuantisedChannel(name).prepare(cover[1])
+        prepared = quantised_channel(name).prepare(cover[1])
         left = prepared.capacity.bytes
         kept = prune_to_size(own, left)
         encoded = encode_to_size(kept, left)
@@ -91,7 +91,7 @@ def files(folder: Path, format_name: str, models: list[str]) -> None:
     found = []
     for model in models:
         scene, _, path = model.partition("=")
-        cover = QuantisedChannel(format_name).prepare(read_model(path))
+        cover = quantised_channel(format_name).prepare(read_model(path))
         plain, stego = (
             folder / f"{Path(path).stem}-{kind}{SUFFIXES[format_name]}" for kind in ("plain", "stego")
         )

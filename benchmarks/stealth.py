@@ -30,13 +30,12 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from channels.lsb.payloads import embed_derived
-from channels.lsb.trained_like import keys
+from channels.lsb.payloads import embed
 from keyss.channels import LOW_BITS
 from keyss.core import Gaussians, UsageError
 from keyss.fitting import FitConfig
 from keyss.lab import stealth_statistics
-from keyss.methods.carry.capacity import CarryCapacity
+from keyss.methods.carry.carry_method import CarryCapacity
 from keyss.rendering import Viewpoints
 from lab.stealth.candidates import candidate_scores
 from methods.carry import carried
@@ -119,10 +118,10 @@ def _make(index: int, scene: str, path: str, hidden: str) -> list[File]:
         return []
     whole = read_model(hidden)
     (secret,) = capacity.prune([whole], [Viewpoints.around(whole)])
-    stego = carried.embed_derived(cover, [(keys(2 * index), secret)], os.urandom(32))
+    stego = carried.embed(cover, [("a key", secret)])
     made.append(File("carried", scene, path, stego, hidden))
     with suppress(UsageError):  # a small model has no room for a payload
-        payload = embed_derived(cover, [(keys(2 * index + 1), os.urandom(PAYLOAD_BYTES))], os.urandom(32))
+        payload = embed(cover, [("a key", os.urandom(PAYLOAD_BYTES))])
         made.append(File("payload", scene, path, payload))
     return made
 

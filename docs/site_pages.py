@@ -19,7 +19,7 @@ from mkdocs.structure.files import File, Files
 
 import keyss
 from keyss.cli import main
-from keyss.cli.command_table import MODULES
+from keyss.cli.entry import MODULES
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = {

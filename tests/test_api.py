@@ -225,11 +225,11 @@ def test_public_api() -> None:
 @pytest.mark.parametrize(
     ("secrets", "words"),
     [
-        (["g.ply"], r"expected Secret\(scene, key\), got str"),
-        ("g.ply", r"expected a list, such as \[Secret"),
-        (Secret("g.ply", "key"), r"expected a list, such as \[Secret"),
+        (["g.ply"], r"expected a list of Secret\(scene, key\), or of SecretFile, got str"),
+        ("g.ply", "expected a list of Secret"),
+        (Secret("g.ply", "key"), "expected a list of Secret"),
         ([], "expected 1 to"),
-        ([Secret("g.ply", "key"), SecretFile(b"", "other key")], "scenes or files, got both"),
+        ([Secret("g.ply", "key"), SecretFile(b"", "other key")], "got Secret and SecretFile"),
     ],
 )
 def test_secrets_say_what_is_expected(secrets: Any, words: str) -> None:

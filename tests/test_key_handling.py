@@ -15,7 +15,7 @@ import pytest
 from channels.lsb.trained_like import trained_like
 from cli.harness import SMALL, write_workspace
 from keyss.channels import LowBitsReader
-from keyss.cli import command_table, entry, main
+from keyss.cli import entry, main
 from keyss.core import KeyssError
 from keyss.keys import DerivedKey
 from keyss.methods import registry
@@ -97,11 +97,11 @@ def test_key_is_never_written_or_printed(
 
 
 def test_no_option_takes_a_key() -> None:
-    asked = [(name, []) for name in command_table.MODULES] + [
+    asked = [(name, []) for name in entry.MODULES] + [
         ("hide", ["--method", name, "--help"]) for name in registry.METHODS
     ]
     for name, arguments in asked:
-        options = entry.options_of(command_table.parse_target(name, arguments))
+        options = entry.options_of(entry.parse_target(name, arguments))
         keys = {name: hint for name, hint in options.items() if "key" in name}
         for name in keys.keys() - {"wrong_keys", "key_encoder"}:
             assert "Path" in str(keys[name]), name

@@ -1,7 +1,9 @@
-"""Links and names in the documents, versions and pins."""
+"""Links and names in the documents, versions, pins and exports."""
 
 from __future__ import annotations
 
+import ast
+import importlib
 import pkgutil
 import re
 import tomllib
@@ -68,3 +70,22 @@ def test_minimum_versions_are_pinned() -> None:
         if name != "torch" and not (pinned.get(name, "") + ".").startswith(version + ".")
     }
     assert different == {}
+
+
+SOURCES = Path(importlib.import_module("keyss").__file__ or "").parent
+PACKAGES = [
+    ".".join(stub.parent.relative_to(SOURCES.parent).parts) for stub in sorted(SOURCES.rglob("*.pyi"))
+]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_exports_match_stub(package: str) -> None:
+    module = importlib.import_module(package)
+    stub = ast.parse(Path(module.__file__ or "").with_suffix(".pyi").read_text())
+    for node in stub.body:
+        assert isinstance(node, ast.ImportFrom)
+        home = importlib.import_module(f"{package}.{node.module}")
+        for alias in node.names:
+            assert alias.name == alias.asname  # else type checkers do not see it
+            assert getattr(module, alias.name) is getattr(home, alias.name)
+            assert importlib.util.find_spec(f"{package}.{alias.name}") is None  # a submodule would replace it

@@ -62,4 +62,4 @@ def test_limits_do_not_depend_on_others_unless_it_warns(needed: list[int]) -> No
         assert limits == [max(0, 1100 // len(needed) - 100)] * len(needed)
     if any(limit < min(size, most) for size, limit, most in zip(needed, limits, alone, strict=True)):
         with pytest.warns(KeyssWarning, match="can notice"):
-            capacity.warn_of_sharing(needed)
+            capacity.limits(needed, warn=True)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache, reduce
-from operator import xor
+from functools import cache
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ import reedsolo
 import torch
 from hypothesis import given, settings, strategies as st
 
-from keyss.channels.reed_solomon import Codewords, _recurrence
+from keyss.channels.reed_solomon import Codewords
 from keyss.core import InputError
 
 
@@ -87,15 +86,6 @@ def test_an_error_costs_two_shards(k: int, wrong: int, lost: int, seed: int) -> 
     rows = codewords.encode(data)[left]
     rows[:wrong] ^= random.integers(1, 256, (wrong, WIDTH), np.uint8)
     assert codewords.decode(left, rows, errors=True) == data
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.lists(st.sampled_from([0, 1, 7]), min_size=1, max_size=8))
-def test_recurrences_hold(sums: list[int]) -> None:
-    found = _recurrence(sums)
-    for index in range(len(found) - 1, len(sums)):
-        products = (reedsolo.gf_mul(each, sums[index - back]) for back, each in enumerate(found))
-        assert reduce(xor, products) == 0
 
 
 def test_long_codewords_with_losses_and_errors() -> None:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import cheap_keys
 from files.scene_files import write_blender, write_nerfstudio
-from keyss.cli import command_table
+from keyss.cli import entry
 from keyss.fitting import ImageQuality
 from keyss.measure import BaselineQuality, RenderFidelity
 from keyss.runs import HideMetrics
@@ -37,7 +37,7 @@ METRICS = HideMetrics(
     details={"capacity": 1000, "bits_per_gaussian": [568, 600]},
 )
 SMALL = ("--preset", "quick", "--iterations", "20", "--max-gaussians", "100", "--device", "cpu")
-COMMANDS = list(command_table.MODULES)
+COMMANDS = list(entry.MODULES)
 PROGRAM = [sys.executable, "-c", cheap_keys.PROGRAM]
 
 

@@ -43,7 +43,6 @@ def test_interrupted_run(keyss: Run, photos: list[Path]) -> None:
     result = keyss("info run")
     assert result.status == 0, result.err
     assert re.search(r"kind +unfinished fit", result.out)
-    assert re.search(r"interrupted after [78] training steps", result.out)
     assert "--resume continues it" in result.out
     assert_refused(keyss("evaluate run"), 4, "found an interrupted one, which `keyss info run` describes")
 

@@ -1,4 +1,4 @@
-"""--quiet, --verbose, and estimates before long runs."""
+"""--quiet, --verbose, and plans before long runs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.harness import SMALL, Result, Run
+from cli.harness import SMALL, Result, Run, listing, scene_arguments
 from keyss import progress
 from keyss.files import write_model
 from keyss.runs import planning
@@ -66,3 +66,25 @@ def test_estimates_of_long_runs_are_announced(
     words = r"about \d+ s on the CPU, \d\.\d GB of memory, up to \d+ MB of disk"
     assert re.search(rf"^fit: {words}\n.*fit b: 20 steps", fit(keyss, scene, "--overwrite").err, re.DOTALL)
     assert "about" not in fit(keyss, scene, "-q", "--overwrite").err
+
+
+def test_dry_run(keyss: Run, workspace: Path, tmp_path: Path) -> None:
+    scenes = scene_arguments(workspace)
+    result = keyss("hide", "--publish", "converted", *scenes, "-o", tmp_path / "out", *SMALL, "--dry-run")
+    assert result.status == 0, result.err
+    for words in ("capacity ", "cost ", " of memory", " of disk"):
+        assert words in result.out, words
+    assert re.search(r"up to [5-9]\d\d Gaussians of SH degree 3", result.out)
+    assert "appended to the cover's 100" in result.out
+    assert listing(tmp_path) == {}
+    result = keyss("hide", *scenes, "-o", tmp_path / "out", *SMALL, "--dry-run")
+    assert result.status == 0
+    assert "falling back to --publish converted" in result.err  # too few for low bits
+    assert listing(tmp_path) == {}
+
+
+def test_dry_run_of_a_fit(keyss: Run, workspace: Path, tmp_path: Path) -> None:
+    result = keyss("fit", workspace / "a", "-o", tmp_path / "out", *SMALL, "--dry-run")
+    assert result.status == 0, result.err
+    assert all(re.search(rf"^{word} +", result.out, re.M) for word in ("model", "training", "cost"))
+    assert listing(tmp_path) == {}

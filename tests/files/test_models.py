@@ -46,10 +46,7 @@ def test_suffix_of_another_format(tmp_path: Path) -> None:
 def test_unknown_suffixes(tmp_path: Path, name: str) -> None:
     assert not is_model_path(name)
     for write in (lambda path: write_model(path, random_gaussians(5)), lambda p: check_model_output(p, True)):
-        with pytest.raises(
-            UsageError,
-            match=rf"{name}: expected .* ends in {re.escape(known_suffixes())}$",
-        ):
+        with pytest.raises(UsageError, match=rf"{name}: expected .* ends in {re.escape(known_suffixes())}$"):
             write(tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 

@@ -133,9 +133,7 @@ def coincident(**changes: Any) -> Scene:
     """10,000 Gaussians at one place, faint enough that thousands contribute to each pixel."""
     scene = random_scene(count=10_000, width=6, height=5, size=0.5, seed=20, **changes)
     return replace(
-        scene,
-        means=scene.means[:1].expand(10_000, 3) * 0.1,
-        opacities=0.0042 + 0.003 * scene.opacities,
+        scene, means=scene.means[:1].expand(10_000, 3) * 0.1, opacities=0.0042 + 0.003 * scene.opacities
     )
 
 

@@ -42,12 +42,7 @@ def large_scene(**modes: object) -> Scene:
 
 
 @pytest.mark.parametrize(
-    "scene",
-    [
-        large_scene(),
-        large_scene(sh_degree=None, channels=7),
-    ],
-    ids=["colour", "features"],
+    "scene", [large_scene(), large_scene(sh_degree=None, channels=7)], ids=["colour", "features"]
 )
 def test_results_do_not_depend_on_threads(scene: Scene) -> None:
     torch.set_num_threads(1)

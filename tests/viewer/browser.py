@@ -34,7 +34,9 @@ IN_CHROMIUM = [pytest.mark.argon2, pytest.mark.skipif(PROGRAM is None, reason="n
 PATIENCE = 120_000  # milliseconds
 WIDTH, HEIGHT = 400, 300  # of the canvas, beside the panel
 PANEL = 340
+KEYS = ("the first key", "ein zweiter Schlüssel")
 POSE = "#eye=1.5,-1.2,-6&target=0.2,0.1,0"
+FAR = "#eye=3,-2.4,-12&target=0.2,0.1,0"  # engines limit the size of near Gaussians
 CLOSE = 25.0  # dB on the canvas
 Picture = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -46,23 +48,30 @@ def bright_model(count: int, seed: int) -> Gaussians:
     return replace(model, log_scales=0.5 * model.log_scales, sh=sh)
 
 
-def camera_of(address: str, width: int = WIDTH, height: int = HEIGHT) -> Camera:
-    """The camera of a pose in a URL."""
-    found = parse_qs(address.partition("#")[2])
-    eye, target = (torch.tensor([float(n) for n in found[name][0].split(",")]) for name in ("eye", "target"))
+def camera_at(address: str, width: int, height: int) -> Camera:
+    """The page's camera at a pose of its address, as `web/src/page/pose.ts` defines it."""
+    numbers = {name: each[0].split(",") for name, each in parse_qs(address.rpartition("#")[2]).items()}
+    axes = {"z": [0.0, 0, 1], "-y": [0.0, -1, 0]}
+    up = axes.get(",".join(numbers.get("up", ["-y"])))
+    eye, target, up = (
+        torch.tensor([float(value) for value in values]).double()
+        for values in (numbers["eye"], numbers["target"], up or numbers["up"])
+    )
     forward = torch.nn.functional.normalize(target - eye, dim=0)
-    right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward), dim=0)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
     viewmat = torch.eye(4)
     viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    focal = 0.5 * height / math.tan(math.radians(25))
+    viewmat[:3, 3] = -viewmat[:3, :3] @ eye.float()
+    wide, high = (math.tan(math.radians(float(each) / 2)) for each in numbers.get("fov", ["1", "50"]))
+    focal = height / 2 / max(high, wide * height / width)
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return Camera(viewmat, K, width, height)
 
 
 def render_pose(model: Gaussians, address: str, width: int = WIDTH, height: int = HEIGHT) -> Picture:
     """Our render [H, W, 3], 0 to 255, of the pose in a URL."""
-    return (render(model, camera_of(address, width, height)).clamp(0, 1) * 255).numpy().astype(np.float64)
+    camera = camera_at(address, width, height)
+    return (render(model, camera).clamp(0, 1) * 255).numpy().astype(np.float64)
 
 
 def psnr(a: Picture, b: Picture) -> float:

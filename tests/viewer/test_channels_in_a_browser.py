@@ -16,11 +16,10 @@ from keyss.files.formats.spz import SpzCodes
 from keyss.methods import HiddenFile, embed_models
 from keyss.viewer import export_html
 from lab.lifelike import lifelike
-from viewer.browser import CLOSE, IN_CHROMIUM, POSE, Visit, bright_model, psnr, render_pose
+from viewer.browser import CLOSE, IN_CHROMIUM, KEYS, POSE, Visit, bright_model, psnr, render_pose
 
 pytestmark = IN_CHROMIUM
 
-KEYS = ("the first key", "ein zweiter Schlüssel")
 PUBLISHED = {"ply": "ply"} | {suffix.removeprefix("."): publish for publish, suffix in SUFFIXES.items()}
 OTHERS = (*list(PUBLISHED)[1:], "decoded.ply", "appended.ply", "appended.spz", "appended.sog")
 

@@ -16,21 +16,12 @@ from PIL import Image
 from keyss.core import UsageError
 from keyss.files import write_model
 from keyss.viewer import export_html
-from methods.carry.carried import embed
 from serving import serving
-from viewer.browser import IN_CHROMIUM, WEB, Visit, bright_model
+from viewer.browser import IN_CHROMIUM, KEYS, WEB, Visit, bright_model
 
 pytestmark = IN_CHROMIUM
 
-KEY = "the key of the studio"
 FOREIGN = Path(__file__).with_name("foreign.html").read_text()
-
-
-@pytest.fixture(scope="module")
-def stego(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("site") / "model.ply"
-    write_model(path, embed(bright_model(2000, 0), [(KEY, bright_model(150, 1))], entropy=bytes(32)))
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -55,11 +46,11 @@ def test_element_on_another_site(tab: Visit, stego: Path, foreign: tuple[Path, s
         frame = tab.page.frames[1]
         assert frame.title().startswith("Of the studio")
         assert frame.locator("#controls").is_hidden()
-        frame.fill("#key", KEY)
+        frame.fill("#key", KEYS[0])
         frame.press("#key", "Enter")
         tab.page.wait_for_function("() => told.some(([name]) => name === 'opened')")
         events = [each for each in tab.page.evaluate("told") if isinstance(each, list)]
-        assert events == [["load", 2000], ["key-tried", None], ["opened", "model"]]
+        assert events == [["load", 4000], ["key-tried", None], ["opened", "model"]]
         tab.page.goto(f"{origin}/other.html")
         tab.page.wait_for_function("() => told.some(([name]) => name === 'load')")
         assert ["load", 300] in tab.page.evaluate("told")
@@ -90,11 +81,11 @@ def test_poster(tab: Visit, stego: Path, tmp_path: Path) -> None:
     export_html(stego, tmp_path)
     Image.new("RGB", (8, 6), "red").save(tmp_path / "poster.png")
     with serving(tmp_path) as site:
-        tab.page.route("**/model.ply", lambda route: None)  # no answer
+        tab.page.route("**/stego.ply", lambda route: None)  # no answer
         tab.page.goto(f"{site}?poster=poster.png")
         tab.page.wait_for_function("() => document.getElementById('poster').naturalWidth === 8")
         assert tab.page.locator("#poster").is_visible()
-        tab.page.unroute("**/model.ply")
+        tab.page.unroute("**/stego.ply")
         tab.goto(f"{site}?poster=poster.png")
         tab.page.wait_for_selector("#poster", state="hidden")
 
@@ -118,14 +109,14 @@ def test_reader_in_other_engines(chromium: Any, stego: Path, tmp_path: Path, eng
         modules.mkdir(exist_ok=True)
         (modules / name).symlink_to(WEB / "node_modules" / name)
     (modules / "keyss-reader").symlink_to(tmp_path)
-    shutil.copy(stego, modules.parent)
+    shutil.copy(stego, modules.parent / "model.ply")
     page = chromium.new_page()
     with serving(modules.parent) as address:
         page.goto(f"{address}{engine}.html")
-        page.fill("input", KEY)
+        page.fill("input", KEYS[0])
         page.click("button")
         page.wait_for_function(
-            "() => document.querySelector('output').value === '150 Gaussians'", timeout=120_000
+            "() => document.querySelector('output').value === '200 Gaussians'", timeout=120_000
         )
         page.wait_for_timeout(3000)
         picture = np.asarray(Image.open(io.BytesIO(page.locator("canvas").screenshot())).convert("RGB"))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from urllib.parse import parse_qs
 
 import numpy as np
 import pytest
@@ -18,27 +17,7 @@ from keyss.rendering import frame_of
 from keyss.viewer import export_html, look_of_scene, pose_of
 from rendering.test_framing import FLOORS, fog, on_a_floor
 from tiny_scenes import ring_cameras
-from viewer.browser import HEIGHT, PROGRAM, WIDTH, Visit
-
-
-def camera_at(pose: str, width: int, height: int) -> Camera:
-    """The page's camera at a pose of its address, as `web/src/page/pose.ts` defines it."""
-    numbers = {name: each[0].split(",") for name, each in parse_qs(pose.lstrip("#")).items()}
-    axes = {"z": [0.0, 0, 1], "-y": [0.0, -1, 0]}
-    up = axes.get(",".join(numbers.get("up", ["-y"])))
-    eye, target, up = (
-        torch.tensor([float(value) for value in values]).double()
-        for values in (numbers["eye"], numbers["target"], up or numbers["up"])
-    )
-    forward = torch.nn.functional.normalize(target - eye, dim=0)
-    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
-    viewmat = torch.eye(4)
-    viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye.float()
-    wide, high = (math.tan(math.radians(float(each) / 2)) for each in numbers.get("fov", ["1", "50"]))
-    focal = height / 2 / max(high, wide * height / width)
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Camera(viewmat, K, width, height)
+from viewer.browser import HEIGHT, PROGRAM, WIDTH, Visit, camera_at
 
 
 def turned(camera: Camera, quarters: int) -> Camera:

@@ -13,34 +13,11 @@ import pytest
 from cli.harness import PROGRAM as KEYSS
 from keyss.core import Gaussians
 from keyss.files import model_bytes, read_model, write_model
-from keyss.viewer import export_html
-from methods.carry.carried import embed, extract
-from viewer.browser import CLOSE, IN_CHROMIUM, POSE, WEB, Visit, bright_model, psnr, render_pose
+from viewer.browser import CLOSE, FAR, IN_CHROMIUM, KEYS, POSE, WEB, Visit, bright_model, psnr, render_pose
 
 pytestmark = IN_CHROMIUM
 
-KEYS = ("the first key", "ein zweiter Schlüssel")
-FAR = "#eye=3,-2.4,-12&target=0.2,0.1,0"  # engines limit the size of near Gaussians
 AXE = WEB / "node_modules" / "axe-core" / "axe.min.js"
-
-
-@pytest.fixture(scope="module")
-def stego(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A model of 4,000 Gaussians with two secrets."""
-    path = tmp_path_factory.mktemp("published") / "stego.ply"
-    secrets = [(key, bright_model(200, seed)) for seed, key in enumerate(KEYS, start=1)]
-    write_model(path, embed(bright_model(4000, 0), secrets, entropy=bytes(32)))
-    return path
-
-
-@pytest.fixture(scope="module")
-def page_file(stego: Path) -> Path:
-    return export_html(stego, stego.parent / "page.html")[0]
-
-
-@pytest.fixture(scope="module")
-def secrets(stego: Path) -> list[Gaussians]:
-    return [extract(read_model(stego), key).gaussians for key in KEYS]
 
 
 @pytest.fixture(scope="module")

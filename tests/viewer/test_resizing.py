@@ -8,48 +8,22 @@ from typing import Any
 import pytest
 
 from keyss.core import Gaussians
-from keyss.files import read_model, write_model
+from keyss.files import read_model
 from keyss.viewer import export_html
-from methods.carry.carried import embed, extract
 from serving import serving
-from viewer.browser import CLOSE, IN_CHROMIUM, PANEL, Visit, bright_model, psnr, render_pose, visit
+from viewer.browser import CLOSE, FAR, IN_CHROMIUM, KEYS, PANEL, Visit, psnr, render_pose, visit
 
 pytestmark = IN_CHROMIUM
 
-KEY = "the key on the phone"
-# Engines limit the size of near Gaussians.
-POSE = "#eye=3,-2.4,-12&target=0.2,0.1,0"
 PHONE = {"has_touch": True, "is_mobile": True}
 PORTRAIT, LANDSCAPE = {"width": 390, "height": 844}, {"width": 844, "height": 390}
-
-
-@pytest.fixture(scope="module")
-def stego(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("published") / "stego.ply"
-    write_model(path, embed(bright_model(4000, 0), [(KEY, bright_model(200, 1))], entropy=bytes(32)))
-    return path
-
-
-@pytest.fixture(scope="module")
-def published(stego: Path) -> Gaussians:
-    return read_model(stego)
-
-
-@pytest.fixture(scope="module")
-def secret(published: Gaussians) -> Gaussians:
-    return extract(published, KEY).gaussians
-
-
-@pytest.fixture(scope="module")
-def page_file(stego: Path) -> Path:
-    return export_html(stego, stego.parent / "page.html")[0]
 
 
 def assert_drawn(tab: Visit, model: Gaussians) -> tuple[int, int]:
     """Assert that the canvas shows our render at its size; returns width and height."""
     found = tab.picture()
     height, width = found.shape[:2]
-    assert psnr(found, render_pose(model, POSE, width, height)) > CLOSE
+    assert psnr(found, render_pose(model, FAR, width, height)) > CLOSE
     return width, height
 
 
@@ -61,7 +35,7 @@ def test_found_is_found(chromium: Any, page_file: Path) -> None:
         for summary in ("#more", "#keying > summary"):
             tab.page.tap(summary)
             assert tab.page.evaluate(share) < 0.4
-        tab.try_key(KEY)
+        tab.try_key(KEYS[0])
         said = tab.page.locator("[role=status]").inner_text()
         assert said == "The key reveals a model of 200 Gaussians."
         assert tab.page.locator("#progress").is_hidden()
@@ -76,7 +50,7 @@ def test_secret_stays_after_search(chromium: Any, page_file: Path) -> None:
         tab.goto(page_file.as_uri())
         published = tab.picture()
         tab.page.tap("#keying > summary")
-        tab.try_key(KEY, thorough=True)
+        tab.try_key(KEYS[0], thorough=True)
         focused = "document.activeElement.id"
         assert tab.page.evaluate(focused) != "key"  # the on-screen keyboard would cover the canvas
         shown = tab.picture()
@@ -90,44 +64,42 @@ def test_secret_stays_after_search(chromium: Any, page_file: Path) -> None:
 
 
 @pytest.mark.slow
-def test_rotate_phone(chromium: Any, page_file: Path, published: Gaussians) -> None:
+def test_rotate_phone(chromium: Any, page_file: Path, stego: Path) -> None:
     fits = "(panel => panel.scrollWidth <= panel.clientWidth)(document.querySelector('.panel'))"
     with visit(chromium, viewport=PORTRAIT, **PHONE) as tab:
-        tab.goto(page_file.as_uri() + POSE)
+        tab.goto(page_file.as_uri() + FAR)
         heights = []
         for _ in range(2):
-            heights.append(assert_drawn(tab, published)[1])
+            heights.append(assert_drawn(tab, read_model(stego))[1])
             tab.page.tap("#more")
         assert heights[0] > heights[1]
         tab.page.tap("#more")
         for viewport, size in ((LANDSCAPE, (844 - PANEL, 390)), (PORTRAIT, (390, heights[1]))):
             tab.page.set_viewport_size(viewport)
-            assert assert_drawn(tab, published) == size
+            assert assert_drawn(tab, read_model(stego)) == size
             assert tab.page.evaluate(fits)
 
 
 @pytest.mark.slow
-def test_rotate_phone_with_secret(chromium: Any, page_file: Path, secret: Gaussians) -> None:
+def test_rotate_phone_with_secret(chromium: Any, page_file: Path, secrets: list[Gaussians]) -> None:
     with visit(chromium, viewport=PORTRAIT, **PHONE) as tab:
         tab.goto(page_file.as_uri())
         tab.page.tap("#keying > summary")
-        tab.try_key(KEY)
-        tab.at(POSE)
-        size = assert_drawn(tab, secret)
+        tab.try_key(KEYS[0])
+        tab.at(FAR)
+        size = assert_drawn(tab, secrets[0])
         tab.page.tap("#keying > summary")
-        unfolded = assert_drawn(tab, secret)
+        unfolded = assert_drawn(tab, secrets[0])
         assert unfolded[1] < size[1]
         for viewport, size in ((LANDSCAPE, (844 - PANEL, 390)), (PORTRAIT, unfolded)):
             tab.page.set_viewport_size(viewport)
-            assert assert_drawn(tab, secret) == size
+            assert assert_drawn(tab, secrets[0]) == size
             assert tab.page.input_value("#wipe") == "100"
 
 
 @pytest.mark.slow
-def test_resize_element(
-    tab: Visit, stego: Path, published: Gaussians, secret: Gaussians, tmp_path: Path
-) -> None:
-    export_html(stego, tmp_path / "site", look={"pose": POSE.removeprefix("#")})
+def test_resize_element(tab: Visit, stego: Path, secrets: list[Gaussians], tmp_path: Path) -> None:
+    export_html(stego, tmp_path / "site", look={"pose": FAR.removeprefix("#")})
     with serving(tmp_path / "site") as site:
         (tmp_path / "site" / "own.html").write_text(
             "<!doctype html><link rel=icon href=data:,><script src=embed.js></script><keyss-viewer>"
@@ -141,17 +113,17 @@ def test_resize_element(
                 " `width: ${width}px; height: ${height}px` }",
                 [width, height],
             )
-            assert assert_drawn(tab, published) == (width, height)
+            assert assert_drawn(tab, read_model(stego)) == (width, height)
         tab.page.evaluate("document.querySelector('keyss-viewer').setAttribute('key-field', '')")
         frame.locator("main[data-picture=settled]").wait_for()
-        frame.locator("#key").fill(KEY)
+        frame.locator("#key").fill(KEYS[0])
         frame.locator("#key").press("Enter")
         frame.locator("#revealed:not([hidden])").wait_for()
-        tab.at(POSE)
+        tab.at(FAR)
         for style in ("width: 500px; height: 400px", "display: none", "width: 320px; height: 500px"):
             tab.page.evaluate("style => { document.querySelector('keyss-viewer').style = style }", style)
             if "none" not in style:
-                assert_drawn(tab, secret)
+                assert_drawn(tab, secrets[0])
 
 
 def test_panel_fits_a_phone_held_sideways(chromium: Any, page_file: Path) -> None:

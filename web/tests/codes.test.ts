@@ -1,7 +1,7 @@
 import { expect, test } from 'vitest';
 import { decodedLevels } from '../src/channels/lsb/decoded.ts';
 import { lastBits, levelsOf, log2 } from '../src/channels/lsb/fields.ts';
-import { LsbReader } from '../src/channels/lsb/reading.ts';
+import { lsbReader } from '../src/channels/lsb/reading.ts';
 import { sortingOrder } from '../src/core/words.ts';
 import { digest, jsonVector, modelOf } from './vectors.ts';
 
@@ -38,7 +38,7 @@ test.each(FILES)('wrong keys open nothing in %s with as many derivations', async
     salts.push(digest(salt));
     return new Uint8Array(32).fill(7);
   };
-  expect(await (await LsbReader.of(await modelOf(name)))!.open('any', derive)).toBeNull();
+  expect(await (await lsbReader(await modelOf(name)))!.open('any', derive)).toBeNull();
   expect(salts.length).toBe(1);
 });
 
@@ -47,5 +47,5 @@ test.each(['carried.ply', 'appended.ply', 'published.splat'])('%s was not decode
 });
 
 test('codes without capacity have no reader', async () => {
-  expect(await LsbReader.of(await modelOf('published-2.spz'))).toBeNull();
+  expect(await lsbReader(await modelOf('published-2.spz'))).toBeNull();
 });

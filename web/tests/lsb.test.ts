@@ -1,5 +1,5 @@
 import { expect, test } from 'vitest';
-import { LsbReader } from '../src/channels/lsb/reading.ts';
+import { lsbReader } from '../src/channels/lsb/reading.ts';
 import { selected } from '../src/core/gaussians.ts';
 import { openPly, readPly, writePly } from '../src/files/ply.ts';
 import { decrypted } from '../src/keys/keys.ts';
@@ -9,7 +9,7 @@ const REVEALED = jsonVector<Revealed[]>('revealed.json');
 const CARRIED = jsonVector<{ key: string; payload: string }>('carried.json');
 
 test('wrong keys open nothing', async () => {
-  const reader = (await LsbReader.of(readPly(openPly(vector('carried.ply')))))!;
+  const reader = (await lsbReader(readPly(openPly(vector('carried.ply')))))!;
   expect(await reader.open('another key')).toBeNull();
 });
 
@@ -17,14 +17,14 @@ test('payloads survive pruning of a quarter and any order', async () => {
   const { key, payload } = REVEALED.find((each) => each.file === 'keyss.ply')!;
   const model = readPly(openPly(vector('keyss.ply')));
   const rows = Array.from({ length: model.count }, (_, row) => (row * 701) % model.count);
-  const found = await (await LsbReader.of(selected(model, rows.filter((row) => row % 4))))!.open(key);
+  const found = await (await lsbReader(selected(model, rows.filter((row) => row % 4))))!.open(key);
   expect(digest(found!.data)).toBe(payload);
 });
 
 test('one changed bit costs nothing', async () => {
   const model = readPly(openPly(vector('carried.ply')));
   new Uint32Array(model.sh.buffer)[5 * 48 + 20] ^= 1 << 6;
-  expect((await (await LsbReader.of(model))!.open(CARRIED.key))!.data).toEqual(hex(CARRIED.payload));
+  expect((await (await lsbReader(model))!.open(CARRIED.key))!.data).toEqual(hex(CARRIED.payload));
 });
 
 test('added Gaussians are counted', async () => {
@@ -32,8 +32,8 @@ test('added Gaussians are counted', async () => {
   const rows = Array.from({ length: model.count }, (_, row) => row);
   const more = selected(model, [...rows, ...rows]);
   more.means.subarray(3 * model.count).forEach((_, at, own) => (own[at] += 1));
-  expect((await (await LsbReader.of(more))!.open(CARRIED.key))?.foreign).toBeGreaterThan(model.count / 2);
-  expect((await (await LsbReader.of(model))!.open(CARRIED.key))?.foreign).toBeUndefined();
+  expect((await (await lsbReader(more))!.open(CARRIED.key))?.foreign).toBeGreaterThan(model.count / 2);
+  expect((await (await lsbReader(model))!.open(CARRIED.key))?.foreign).toBeUndefined();
 });
 
 test('encrypted payloads match Python', async () => {

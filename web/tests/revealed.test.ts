@@ -7,15 +7,9 @@ import { columns, digest, jsonVector, modelOf, type Revealed } from './vectors.t
 
 const REVEALED = jsonVector<Revealed[]>('revealed.json');
 
-/** In the first channel in which it opens something: to look into all of them would take ten times as long. */
+/** By the quick search if it opens something: the thorough one takes four times as long. */
 async function opened(stego: ReadModel, key: string): Promise<Payload | null> {
-  for (const thorough of [false, true]) {
-    for (const reader of (await channelsOf(stego, thorough)).readers) {
-      const payload = await reader.open(key);
-      if (payload !== null) return payload;
-    }
-  }
-  return null;
+  return (await (await channelsOf(stego, false)).open(key)) ?? (await channelsOf(stego, true)).open(key);
 }
 
 test.each(REVEALED)('revealing $file with $key matches Python bit for bit', async (expected) => {

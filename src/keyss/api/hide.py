@@ -21,24 +21,26 @@ from keyss.api.hide_arguments import (
     read_sources,
     with_renders,
 )
-from keyss.api.hide_files import hide_files
 from keyss.api.hide_metrics import PlainModel, check_quality, hide_metrics
-from keyss.channels import Publish
+from keyss.channels import Publish, open_payload
+from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, ViewOptions
 from keyss.files.formats.ply import with_extras
+from keyss.files.inputs import as_text, read_file
 from keyss.files.models import read_model, reads_as
 from keyss.keys import DerivedKey
 from keyss.keys.derivation import SALT_BYTES
+from keyss.keys.encryption import MAX_PAYLOAD_BYTES
 from keyss.measure.hide_quality import compare
 from keyss.measure.renders import sheet_of
-from keyss.methods.hidden import HiddenScene, pack_companion
+from keyss.methods.hidden import HiddenFile, HiddenScene, pack_companion
 from keyss.methods.method import Context, MethodOptions, Prepared, Source, Stego
 from keyss.methods.plain_models import fit_bound, fit_plain_models
 from keyss.methods.registry import DEFAULT, open_companion, open_model
 from keyss.progress import Reporter, reporter as default_reporter
 from keyss.rendering import Backend, resolve_device
-from keyss.rendering.orbit import is_model
+from keyss.rendering.orbit import is_model, psnr_between
 from keyss.runs.estimates import seconds_for
 from keyss.runs.files import (
     CONFIG,
@@ -46,13 +48,14 @@ from keyss.runs.files import (
     METRICS,
     STEGOS,
     PathLike,
+    as_3dgs_model,
     bound_names,
     companion_names,
     path_of,
     plain_names,
     stego_name,
 )
-from keyss.runs.folder import RunFolder
+from keyss.runs.folder import HIDE_FILES, RunFolder
 from keyss.runs.json_records import record_bytes
 from keyss.runs.planning import check_room, cost_of
 from keyss.runs.run_records import RunConfig, secret_ids, with_seed
@@ -115,7 +118,7 @@ def hide(
         check_not_given(
             cover_model=cover_model, bound=bound, min_psnr=min_psnr, resume=resume, seed=options.fit.seed
         )
-        return hide_files(cover, files, options, place, overwrite, dry_run, reporter)
+        return _hide_files(cover, files, options, place, overwrite, dry_run, reporter)
     given = [Secret(cover, "", cover_model), *(secret for secret in secrets if isinstance(secret, Secret))]
     keys = [secret.key for secret in given[1:]]
     options = replace(options, fit=with_seed(options.fit, place if resume else None, "options", "fit"))
@@ -199,6 +202,48 @@ def hide(
                 look = sheet_of([model.to(target) for model in models], sources)
                 folder.write(results | {CONFIG: settings, METRICS: metrics, LOOK: look})
     return HideResult(stego.gaussians, metrics, survives=prepared.survives)
+
+
+def _hide_files(
+    cover: PathLike | Scene | Gaussians,
+    secrets: Sequence[SecretFile],
+    options: MethodOptions,
+    out: Path | None,
+    overwrite: bool,
+    dry_run: bool,
+    reporter: Reporter,
+) -> HideResult:
+    """Hide files in a model, and open them again to check; see `keyss.hide`."""
+    if isinstance(cover, Scene) or not is_model(cover):
+        raise UsageError("hiding a file needs a model as the cover; `keyss fit` makes one from photos")
+    folder, inputs = None, [cover, *(secret.file for secret in secrets)]
+    if out is not None and not dry_run:
+        paths = [Path(path) for path in inputs if isinstance(path, str | Path)]
+        folder = RunFolder(out, HIDE_FILES, writes=STEGOS, inputs=paths, overwrite=overwrite)
+    with reporter.waiting("hiding", seconds_for("hide a file", cover)):
+        files, model = [_read_secret(secret) for secret in secrets], as_3dgs_model(cover, "the cover")
+        keyed = [(secret.key, file.payload()) for secret, file in zip(secrets, files, strict=True)]
+        stego, survives = options.in_channel(
+            model, lambda channel: (channel.prepare(model).embed(keyed), channel.survives)
+        )
+        with folder.work() if folder else nullcontext():
+            published = stego
+            if folder:
+                name = stego_name(stego)
+                path = folder.write({name: with_extras(stego, cover, model)}) / name
+                published = stego if reads_as(path, stego) else read_model(path)
+            if [HiddenFile.of(open_payload(published, secret.key)) for secret in secrets] != files:
+                raise RuntimeError("the hidden files do not open again from the published file")
+        psnr = psnr_between(model, stego)
+    return HideResult(None if dry_run else stego, survives=survives, psnr=psnr)
+
+
+def _read_secret(secret: SecretFile) -> HiddenFile:
+    """Read the file. Raises InputError if it is missing or too large."""
+    if isinstance(secret.file, bytes):
+        return HiddenFile(secret.name, secret.file)
+    path = Path(secret.file)
+    return HiddenFile(secret.name or as_text(path.name), read_file(path, MAX_PAYLOAD_BYTES))
 
 
 def _entropy(keys: Sequence[str], options: MethodOptions, sources: Sequence[Source]) -> bytes:

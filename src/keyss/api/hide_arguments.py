@@ -66,13 +66,10 @@ def method_for(
 
     Raises UsageError if the method does not support these secrets or keys, and for a preset beside options.
     """
-    if not isinstance(secrets, Sequence) or isinstance(secrets, str):
-        raise UsageError("secrets: expected a list, such as [Secret(scene, key)]")
-    for secret in secrets:
-        if not isinstance(secret, Secret | SecretFile):
-            raise UsageError(f"secrets: expected Secret(scene, key), got {type(secret).__name__}")
-    if len(set(map(type, secrets))) > 1:
-        raise UsageError("secrets: expected scenes or files, got both: hide them in two covers")
+    kinds = set(map(type, secrets)) if isinstance(secrets, Sequence) else {type(secrets)}
+    if len(kinds) > 1 or kinds - {Secret, SecretFile} or not isinstance(secrets, Sequence):
+        names = " and ".join(sorted(kind.__name__ for kind in kinds))
+        raise UsageError(f"secrets: expected a list of Secret(scene, key), or of SecretFile, got {names}")
     if isinstance(chosen, MethodOptions):
         if preset != "default":
             raise UsageError(f'`preset="{preset}"` is for a method that is given by name, not by its options')

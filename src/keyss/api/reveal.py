@@ -15,7 +15,7 @@ from keyss.methods.hidden import Frame
 from keyss.rendering import Backend, resolve_device
 from keyss.runs.files import PathLike, as_model
 from keyss.runs.folder import check_not_published
-from keyss.runs.revealing import Revealed, Verification, check_model, check_secret, reveal_secret
+from keyss.runs.revealing import Revealed, SecretCheck, Verification, check_model, count_of, reveal_secret
 
 
 def reveal(
@@ -104,5 +104,9 @@ def verify(
                 state = "; ".join(checked.problems) or "sound"
                 raise WrongKeyError(f"{which}{error}; the model itself: {state}") from error
         problems = [str(warning.message) for warning in caught if issubclass(warning.category, KeyssWarning)]
-        secrets.append(check_secret(revealed, problems))
+        problems += revealed.warnings
+        recovered, unit = revealed.recovered, "Gaussians" if revealed.file is None else "bytes"
+        if revealed.file is None and not recovered.whole and not problems:
+            problems.append(count_of(recovered))
+        secrets.append(SecretCheck(recovered.found, recovered.hidden, unit, tuple(problems)))
     return Verification(name, checked, tuple(secrets))

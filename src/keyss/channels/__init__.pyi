@@ -1,4 +1,8 @@
-from .appended.appended_channel import APPENDED as APPENDED, AppendedReader as AppendedReader
+from .appended.appended_channel import (
+    APPENDED as APPENDED,
+    AppendedReader as AppendedReader,
+    appended_count as appended_count,
+)
 from .appended.words import is_appended as is_appended
 from .base import Capacity as Capacity, Channel as Channel, PreparedCover as PreparedCover
 from .colours.colours_channel import (
@@ -35,9 +39,9 @@ from .lsb.low_bits_capacity import (
     check_payload_fits as check_payload_fits,
 )
 from .lsb.quantised import (
-    QuantisedChannel as QuantisedChannel,
     QuantisedCover as QuantisedCover,
     QuantisedReader as QuantisedReader,
+    quantised_channel as quantised_channel,
 )
 from .lsb.salts import salt_rows as salt_rows
 from .lsb.shards import Message as Message, Shards as Shards

@@ -1,17 +1,14 @@
 """The protocol of all channels: places in a published model where bits are stored and found with a key.
 
-A channel finds slots for bits in a cover, writes and reads them. What they mean is the same in every channel
-(see `container`): *payloads*, bytes that are read completely or not at all.
-
-How a model is published determines its channel (`publishing`); readers try all channels.
+A channel finds slots for bits in a cover, writes and reads them; `container` says what they mean. How a model
+is published determines its channel (`publishing`); readers try all channels.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 from keyss.channels.container import Payload, warn_of_others
 from keyss.core.gaussians import Gaussians
@@ -51,35 +48,29 @@ class Capacity:
         """Maximum bytes of one payload."""
         return self.shares[-1][1]
 
-    def limits(self, needed: Sequence[int]) -> list[int]:
+    def limits(self, needed: Sequence[int], *, warn: bool = False) -> list[int]:
         """Maximum bytes of payloads that need `needed` bytes: of the first share that holds each.
 
-        If these shares exceed the whole, they are equal.
+        If these shares exceed the whole, they are equal. `warn`: warn (KeyssWarning) if a payload then gets
+        fewer bytes than it would alone.
         """
         chosen = first_shares(self.shares, [min(size, self.bytes) for size in needed])
-        if chosen is None:
-            return [self.equal(len(needed))] * len(needed)
-        return [self.shares[index][1] for index in chosen]
-
-    def warn_of_sharing(self, needed: Sequence[int]) -> None:
-        """Warn (KeyssWarning) if a payload gets fewer bytes than it would alone."""
-        if any(
-            limit < min(size, self.limits([size])[0])
-            for size, limit in zip(needed, self.limits(needed), strict=True)
-        ):
+        if chosen is not None:
+            return [self.shares[index][1] for index in chosen]
+        limit = self.equal(len(needed))
+        if warn and any(limit < min(size, self.limits([size])[0]) for size in needed):
             warn_of_others()
+        return [limit] * len(needed)
 
 
 class PreparedCover(Protocol):
     """A cover with known capacity in a channel."""
 
     @property
-    def cover(self) -> Gaussians:
-        """The cover."""
+    def cover(self) -> Gaussians: ...
 
     @property
-    def capacity(self) -> Capacity:
-        """The capacity of the cover."""
+    def capacity(self) -> Capacity: ...
 
     def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
         """Embed one (key, payload) per secret.
@@ -90,20 +81,14 @@ class PreparedCover(Protocol):
         """
 
 
-class Channel(ABC):
+@dataclass
+class Channel:
     """A place for bits in a model."""
 
     place: str  # in messages: "low bits", "quantised values of spz" and so on
-    survives: ClassVar[bool] = False  # True if secrets survive conversion to other formats
-    grows: ClassVar[bool] = False  # see `Capacity`
-
-    @abstractmethod
-    def prepare(self, cover: Gaussians) -> PreparedCover:
-        """Find the carriers. Raises UsageError for a cover without capacity, or if changes would be visible.
-
-        Raises OutputError for a cover that the published format cannot hold.
-        """
-
-    @abstractmethod
-    def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
-        """Estimate the capacity of a cover that is not fitted yet."""
+    # Finds the carriers of a cover. Raises UsageError for one without capacity, or if changes would be
+    # visible, OutputError for one that the published format cannot hold.
+    prepare: Callable[[Gaussians], PreparedCover]
+    estimate_capacity: Callable[[int, int], Capacity]  # of so many Gaussians of an SH degree, not fitted yet
+    survives: bool = False  # True if secrets survive conversion to other formats
+    grows: bool = False  # see `Capacity`

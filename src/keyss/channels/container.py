@@ -1,19 +1,12 @@
-"""The container of every channel: from a payload to sealed bytes and shards, and back with a key.
+"""The container of every channel (docs/byte-layout.md): from a payload to sealed bytes and shards, and back.
 
-`seal` packs a payload into bytes, compresses them if that helps, and encrypts and authenticates them under a
-*data key*. A *record* comes first, by which a reader detects foreign Gaussians (see `foreign`). Where a
-channel may lose slots, Reed-Solomon divides sealed bytes into shards with redundancy (`reed_solomon`). The
-channel finds slots in a cover, writes shards into them and reads them.
+Sealed bytes begin with a *record*, by which a reader detects foreign Gaussians (see `foreign`). Where a
+channel may lose slots, Reed-Solomon divides them into shards with redundancy (`reed_solomon`).
 
 All randomness is derived from `entropy`, which must be secret: otherwise the holder of one key could compute
 the file without the other secrets and compare. A salt depends on the file, in colours on its cover, so
 guessing a key takes a run of Argon2id for each. No key stream is used twice: data keys depend on entropy and
 all payloads.
-
-*Parameters*, encrypted like shards, tell how shards lie in their slots:
-
-    check (8 bytes, derived from the data key), version (1), depth (1), codewords (4), shards of one (2), data
-    shards of one (2); little-endian
 """
 
 from __future__ import annotations

@@ -28,7 +28,6 @@ from __future__ import annotations
 import math
 import os
 import struct
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -121,59 +120,12 @@ def exact_foreign(record: bytes, secret: bytes, ids: Bytes) -> int:
     return math.ceil(len(ids) * foreign_share(secret, ids, bloom, count))
 
 
-@dataclass(frozen=True)
-class _Rows:
-    """Gaussians in bins."""
-
-    ids: Bytes  # [M, 16]
-    areas: Doubles  # [M] opacity x area in the own frame, of the middle of the bins
-    outside: int  # number of Gaussians out of range
-
-    @staticmethod
-    def of(model: Gaussians, to_own: Similarity, secret: bytes, reading: bool) -> _Rows:
-        means = to_own.apply_points(model.means.detach().double())  # float32 may overflow
-        log_scales = doubles(model.log_scales) + math.log(to_own.scale)
-        numbers = np.hstack(
-            [means.numpy(), log_scales, doubles(model.opacities)[:, None], doubles(model.sh[:, 0])]
-        )
-        seen = np.isfinite(numbers).all(axis=1) & (numbers[:, 6] > _VISIBLE[int(reading)])
-        numbers = numbers[seen].clip(_LOW, _HIGH)
-        bounds = np.zeros_like(_ERRORS) if reading else _ERRORS  # a format may move numbers out of range
-        far = (numbers <= _LOW + bounds) | (numbers >= _HIGH - bounds)
-        outside = int((far[:, :3].any(axis=1) | (far[:, 3:6].sum(axis=1) > 1)).sum())
-        steps = numbers / _BINS
-        steps[:, :3] += _offsets(np.frombuffer(expand(secret, "bins", 32), np.uint8)[:3])
-        blocks = np.zeros((len(steps), 16), np.int8)
-        blocks[:, :3] = np.floor(steps[:, :3])
-        borders = encrypted_blocks(expand(secret, "borders", 32), blocks.view(np.uint8))
-        offsets = _offsets(borders[:, : len(_BINS) - 3])
-        steps[:, 3:] += offsets
-        bins = np.floor(steps)
-        middles = (bins[:, 3:] + 0.5 - offsets) * _BINS[3:]
-        if reading:
-            near = np.minimum(steps - bins, bins + 1 - steps) < _ERRORS / _BINS
-            sure: Flags = ~(near & (numbers > _LOW) & (numbers < _HIGH)).any(axis=1)
-            bins, middles = bins[sure], middles[sure]
-        areas = np.exp(np.sort(middles[:, :3])[:, 1:].sum(axis=1)) * middles[:, 3].clip(0.02, 1)
-        ids = np.zeros((len(bins), 16), np.int8)
-        ids[:, : len(_BINS)] = bins
-        return _Rows(ids.view(np.uint8), areas, outside)
-
-    def among(self, count: int, area: float) -> Integers:
-        """Places in the Bloom filter of a cover with `count` Gaussians and a total `area`."""
-        return (
-            np.rint(2 / (1 / max(1, count) + self.areas / max(1e-30, area)))
-            .astype(np.int64)
-            .clip(8 * _BLOOM_BYTES)
-        )
-
-
 def coarse_record(secret: bytes, cover: Gaussians, appended: int, to_own: Similarity) -> bytes:
     """The record of a cover and the number of Gaussians `appended` to it; `to_own`: world to own frame."""
-    rows = _Rows.of(cover, to_own, secret, reading=False)
-    area = float(np.float32(rows.areas.sum()))
-    bloom = bloom_filter(secret, rows.ids, _BLOOM_BYTES, rows.among(len(rows.ids), area))
-    return _COARSE.pack(_faint(cover) + appended, rows.outside, len(rows.ids), area, bloom)
+    ids, areas, outside = _in_bins(cover, to_own, secret, reading=False)
+    area = float(np.float32(areas.sum()))
+    bloom = bloom_filter(secret, ids, _BLOOM_BYTES, _among(areas, len(ids), area))
+    return _COARSE.pack(_faint(cover) + appended, outside, len(ids), area, bloom)
 
 
 def coarse_foreign(record: bytes, secret: bytes, model: Gaussians, to_own: Similarity) -> int:
@@ -181,14 +133,53 @@ def coarse_foreign(record: bytes, secret: bytes, model: Gaussians, to_own: Simil
 
     0 if they are at most a share _LEAST_SHARE. All are foreign if hardly anything is left of the cover.
     """
-    faint, outside, count, area, bloom = _COARSE.unpack(record)
-    here, rows = _faint(model), _Rows.of(model, to_own, secret, reading=True)
+    faint, outside_before, count, area, bloom = _COARSE.unpack(record)
+    here, (ids, areas, outside) = _faint(model), _in_bins(model, to_own, secret, reading=True)
     visible = len(model) - here
-    foreign = foreign_share(secret, rows.ids, bloom, rows.among(count, area), _GONE)
+    foreign = foreign_share(secret, ids, bloom, _among(areas, count, area), _GONE)
     sure = round(foreign * visible) if foreign > _LEAST_SHARE else 0
-    if rows.outside > outside + _LEAST_SHARE * visible:
-        sure = max(sure, rows.outside - outside)
+    if outside > outside_before + _LEAST_SHARE * visible:
+        sure = max(sure, outside - outside_before)
     return sure + (here - faint if here > _MORE * faint else 0)
+
+
+def _in_bins(
+    model: Gaussians, to_own: Similarity, secret: bytes, reading: bool
+) -> tuple[Bytes, Doubles, int]:
+    """IDs [M, 16] of Gaussians in bins, opacity x area [M] of their bins, and how many are out of range."""
+    means = to_own.apply_points(model.means.detach().double())  # float32 may overflow
+    log_scales = doubles(model.log_scales) + math.log(to_own.scale)
+    numbers = np.hstack(
+        [means.numpy(), log_scales, doubles(model.opacities)[:, None], doubles(model.sh[:, 0])]
+    )
+    seen = np.isfinite(numbers).all(axis=1) & (numbers[:, 6] > _VISIBLE[int(reading)])
+    numbers = numbers[seen].clip(_LOW, _HIGH)
+    bounds = np.zeros_like(_ERRORS) if reading else _ERRORS  # a format may move numbers out of range
+    far = (numbers <= _LOW + bounds) | (numbers >= _HIGH - bounds)
+    outside = int((far[:, :3].any(axis=1) | (far[:, 3:6].sum(axis=1) > 1)).sum())
+    steps = numbers / _BINS
+    steps[:, :3] += _offsets(np.frombuffer(expand(secret, "bins", 32), np.uint8)[:3])
+    blocks = np.zeros((len(steps), 16), np.int8)
+    blocks[:, :3] = np.floor(steps[:, :3])
+    borders = encrypted_blocks(expand(secret, "borders", 32), blocks.view(np.uint8))
+    offsets = _offsets(borders[:, : len(_BINS) - 3])
+    steps[:, 3:] += offsets
+    bins = np.floor(steps)
+    middles = (bins[:, 3:] + 0.5 - offsets) * _BINS[3:]
+    if reading:
+        near = np.minimum(steps - bins, bins + 1 - steps) < _ERRORS / _BINS
+        sure: Flags = ~(near & (numbers > _LOW) & (numbers < _HIGH)).any(axis=1)
+        bins, middles = bins[sure], middles[sure]
+    areas = np.exp(np.sort(middles[:, :3])[:, 1:].sum(axis=1)) * middles[:, 3].clip(0.02, 1)
+    ids = np.zeros((len(bins), 16), np.int8)
+    ids[:, : len(_BINS)] = bins
+    return ids.view(np.uint8), areas, outside
+
+
+def _among(areas: Doubles, count: int, area: float) -> Integers:
+    """Places [M] in the Bloom filter of a cover with `count` Gaussians and a total `area`."""
+    places = np.rint(2 / (1 / max(1, count) + areas / max(1e-30, area)))
+    return places.astype(np.int64).clip(8 * _BLOOM_BYTES)
 
 
 def _faint(model: Gaussians) -> int:

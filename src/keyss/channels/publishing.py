@@ -50,14 +50,14 @@ def channel_for(
         return COLOURS
     from keyss.channels.lsb.decoded import Decoded
     from keyss.channels.lsb.low_bits import LOW_BITS
-    from keyss.channels.lsb.quantised import QuantisedChannel
+    from keyss.channels.lsb.quantised import quantised_channel
 
     if format is None and isinstance(cover, CodedGaussians):
-        return QuantisedChannel(cover.codes.name)
+        return quantised_channel(cover.codes.name)
     if format in SUFFIXES:
-        return QuantisedChannel(format)
+        return quantised_channel(format)
     decoded = None if cover is None else Decoded.of(cover)
-    return QuantisedChannel(decoded.codes.name, decoded) if decoded else LOW_BITS
+    return quantised_channel(decoded.codes.name, decoded) if decoded else LOW_BITS
 
 
 def suffix_of(stego: Gaussians) -> str:

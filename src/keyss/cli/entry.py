@@ -1,14 +1,19 @@
-"""The entry point: runs a command, and turns errors into one line and an exit status."""
+"""The entry point: runs a command, and turns errors into one line and an exit status.
+
+A command's module is imported when it runs, and imports heavy packages inside the command, which keeps
+`keyss --help` fast.
+"""
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import signal
 import sys
 import time
 import warnings
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import is_dataclass
 from typing import Any, get_type_hints
@@ -32,6 +37,39 @@ _LEVELS = {"-q": -1, "--quiet": -1, "-v": 1, "--verbose": 1}
 _KEY_OPTIONS = ("-k", "-p", "--key", "--keys", "--password", "--passphrase")  # options that people may expect
 # Arguments whose options have another name.
 _RENAMED = {"key": "key_file", "keys": "key_file", "secrets": "secret", "model": "secret_model"}
+# The commands, in the groups of `keyss --help`, and the module of each.
+GROUPS = {
+    "make": {
+        "demo": "cli.make",
+        "fit": "cli.make",
+        "hide": "cli.hide_command",
+        "keygen": "cli.make",
+        "convert": "cli.make",
+    },
+    "open": {"reveal": "cli.open_and_show", "verify": "cli.open_and_show"},
+    "look": {"view": "cli.open_and_show", "render": "cli.open_and_show", "info": "cli.open_and_show"},
+    "measure": {"evaluate": "cli.open_and_show", "audit": "lab.lab_commands"},
+    "many": dict.fromkeys(("compare", "reproduce", "sweep"), "lab.lab_commands"),
+    "check": {"doctor": "cli.doctor"},
+}
+MODULES = {name: module for group in GROUPS.values() for name, module in group.items()}
+
+_PAGE = """usage: keyss COMMAND [OPTIONS]
+
+Hide a 3D Gaussian Splatting scene inside another one and open it only with a key.
+{commands}
+
+`keyss COMMAND --help` shows the options of a command and examples.
+
+  -q, --quiet              print nothing but paths of results, and errors
+  -v, --verbose            show more progress, and the time at the end
+  -V, --version            print the version
+  --completion {{bash,zsh}}  print a completion script for the shell
+
+A key is read from --key-file, from the environment variable KEYSS_KEY, or from a prompt.
+Exit status: 0 done, 2 wrong usage, 3 wrong key, 4 unreadable input, 5 unwritable output,
+6 missing backend, 7 failed quality check, 8 out of memory, 70 internal error,
+130 interrupted, 141 broken pipe, 143 terminated."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -70,38 +108,60 @@ def _run(arguments: list[str], options: dict[str, Any]) -> None:
 
     import tyro
 
-    from keyss.cli import command_table
-
     if arguments in (["--help"], ["-h"]):
-        print(command_table.help_page())
+        print(help_page())
         return
     if name == "--completion":
         _print_completion(rest)
         return
-    if name not in command_table.MODULES:
-        raise UsageError(f"there is no command {name!r}: {did_you_mean(name.lower(), command_table.MODULES)}")
+    if name not in MODULES:
+        raise UsageError(f"there is no command {name!r}: {did_you_mean(name.lower(), MODULES)}")
     if any(word.partition("=")[0] in _KEY_OPTIONS for word in rest):  # the parser would print its value
         raise UsageError(
             "a key cannot be an argument, which other users could see: give --key-file FILE, set KEYSS_KEY, "
             "or type it at the prompt"
         )
-    command = command_table.parse_target(name, rest)
-    options.update(options_of(command))
-    tyro.cli(command, prog=f"keyss {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))
+    target = parse_target(name, rest)
+    options.update(options_of(target))
+    tyro.cli(target, prog=f"keyss {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def _print_completion(arguments: list[str]) -> None:
     import tyro
 
-    from keyss.cli import command_table
-
     if arguments not in (["bash"], ["zsh"]):
         raise UsageError("--completion: expected bash or zsh")
     app = tyro.extras.SubcommandApp()
-    for name in command_table.MODULES:
-        app.command(name=name)(command_table.parse_target(name, []))
+    for name in MODULES:
+        app.command(name=name)(parse_target(name, []))
     printing = ["--tyro-print-completion", *arguments]
     app.cli(prog="keyss", args=printing, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def command(name: str) -> Callable[..., None]:
+    """The function of a command."""
+    function: Callable[..., None] = getattr(importlib.import_module(f"keyss.{MODULES[name]}"), name)
+    return function
+
+
+def parse_target(name: str, arguments: Sequence[str]) -> Callable[..., None]:
+    """The function to parse: for `hide`, with the options of the method named in `arguments`."""
+    if name == "hide":
+        from keyss.cli.hide_command import with_options_of_method
+
+        return with_options_of_method(arguments)
+    return command(name)
+
+
+def help_page() -> str:
+    """The text of `keyss --help`: a line for each command."""
+    lines = []
+    for group, names in GROUPS.items():
+        lines += ["", f"{group}:"]
+        for name in names:
+            summary = (command(name).__doc__ or "").partition("\n")[0]
+            lines.append(f"  {name:<12} {summary}")
+    return _PAGE.format(commands="\n".join(lines))
 
 
 def explain(error: BaseException) -> tuple[int, str]:
@@ -220,12 +280,12 @@ def as_flags(message: str, options: Collection[str]) -> str:
     return re.sub("`([^`]*)`", flags, message)
 
 
-def options_of(command: Any) -> dict[str, Any]:
+def options_of(target: Any) -> dict[str, Any]:
     """Names and types of the options of a command, those of groups included."""
     from tyro.conf import Positional
 
     options: dict[str, Any] = {}
-    for name, hint in get_type_hints(command, include_extras=True).items():
+    for name, hint in get_type_hints(target, include_extras=True).items():
         if is_dataclass(group := getattr(hint, "__origin__", hint)):
             options |= options_of(group)
         elif name != "return" and Positional not in getattr(hint, "__metadata__", ()):

@@ -23,6 +23,7 @@ from keyss.cli.arguments import (
     optional,
     switch,
     verb,
+    waiting_for,
 )
 from keyss.cli.keys import given_keys, key_of_file
 from keyss.core.errors import UsageError
@@ -194,11 +195,9 @@ def convert(
     check_exists(model, keys=key_file)
     import keyss
     from keyss.cli.tables import print_conversion
-    from keyss.progress import waiting
-    from keyss.runs.estimates import seconds_to_convert
 
     given = given_keys(key_file)
-    with waiting(f"converting {model.name}", seconds_to_convert(model, out, len(given))):
+    with waiting_for("convert, checking a key" if given else "convert", "converting", model):
         conversion = keyss.convert(
             model,
             out,

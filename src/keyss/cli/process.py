@@ -21,22 +21,6 @@ from keyss._interrupts import ENDING
 _IMPORTING = "<frozen importlib._bootstrap>"
 _CLEAR_LINE = b"\r\x1b[K\x1b[?25h"  # and show the cursor, which progress lines hide
 REPLACING = "keyss.replacing"  # a handler of encoding errors
-# Replacements of characters that an output's encoding lacks, such as ASCII or an old code page.
-_PLAIN = {
-    **dict.fromkeys("•·×", "*"),
-    **dict.fromkeys("─━╸╺╴╶—–−", "-"),
-    **dict.fromkeys("│┃╎", "|"),
-    **dict.fromkeys("╭╮╰╯┌┐└┘├┤┬┴┼", "+"),
-    **dict.fromkeys("‘’", "'"),
-    **dict.fromkeys("“”", '"'),
-    "…": "...",
-    "≤": "<=",
-    "≥": ">=",
-    "±": "+-",
-    "≈": "~",
-    "→": "->",
-    "\N{NO-BREAK SPACE}": " ",
-}
 
 
 def main() -> NoReturn:
@@ -140,13 +124,13 @@ def prepare_streams() -> None:
 
 
 def _replace(error: UnicodeError) -> tuple[str | bytes, int]:
-    """A similar character or `?`; undecodable bytes of a file name do not change."""
+    """`?` for a character that the encoding lacks; undecodable bytes of a file name do not change."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     first = error.object[error.start]
     if "\udc80" <= first <= "\udcff":
         return bytes([ord(first) - 0xDC00]), error.start + 1
-    return _PLAIN.get(first, "?"), error.start + 1
+    return "?", error.start + 1
 
 
 codecs.register_error(REPLACING, _replace)

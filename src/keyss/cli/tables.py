@@ -16,7 +16,7 @@ from rich.text import Text
 from keyss import progress
 from keyss.files.inputs import is_standard
 from keyss.methods.method import role_of
-from keyss.progress import about, clock
+from keyss.progress import clock
 from keyss.runs.json_records import record_bytes
 
 if TYPE_CHECKING:
@@ -128,9 +128,7 @@ def print_cost(cost: Cost, rows: Sequence[tuple[str, str]] = (), notes: Iterable
         [
             *rows,
             *([("training", f"steps: {', '.join(of)}")] if any(cost.steps) else []),
-            ("time", f"about {about(cost.seconds)} on {cost.where}"),
-            ("memory", f"about {cost.memory_bytes / 1e9:.1f} GB"),
-            ("disk", f"up to {cost.disk_bytes / 1e6:,.0f} MB at once, checkpoints included"),
+            ("cost", str(cost)),
             *(("note", note) for note in notes),
         ]
     )

@@ -156,7 +156,7 @@ def up_direction(cameras: Sequence[Camera]) -> Tensor | None:
     planar = bool(spread[1] > 0.05 and spread[0] < 0.2 * spread[1])
     if planar and float(normal @ mean) > 0.5 * float(mean.norm()):
         return normal
-    return _unit(mean)
+    return torch.nn.functional.normalize(mean, dim=0)
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class _Capture:
             forward = camera_axes(cameras, 2).mean(0)
             across = forward - up * (up @ forward)
             if float(across.norm()) > _MIN_HEADING:
-                heading = _unit(across)
+                heading = torch.nn.functional.normalize(across, dim=0)
         return _Capture(focus, distance if distance > 0 else 1.0, up, heading)
 
 
@@ -197,7 +197,3 @@ def _rotation(secret: _Capture, cover: _Capture) -> Tensor:
         targets, sources = torch.stack([cover.up, cover.heading]), torch.stack([secret.up, secret.heading])
         rotation, _ = Rotation.align_vectors(targets, sources, weights=[math.inf, 1])
     return torch.from_numpy(rotation.as_matrix())
-
-
-def _unit(vector: Tensor) -> Tensor:
-    return torch.nn.functional.normalize(vector, dim=0)

@@ -18,7 +18,6 @@ class ModelFormat:
     codec: str  # "glb", "spz:SpzCodes": module or class of `formats/` with `read(data)` and `write(model)`
     magic: tuple[bytes, ...] = ()  # possible first bytes; empty, as `archive`: identified by suffix
     archive: tuple[bytes, ...] = ()  # possible first bytes, of an archive that may hold other data
-    write_seconds: float = 3.0  # processor seconds to write a million Gaussians of SH degree 3
     in_page: bool = False  # the page reads it (web/src/files/models.ts); others are converted for it
     is_exact: bool = False  # keeps every bit
 
@@ -31,35 +30,14 @@ _PLY = "compressed_ply:CompressedPlyCodes"  # `files/models.py` reads and writes
 # A file name belongs to the first format with a matching suffix.
 FORMATS = (
     ModelFormat(
-        "compressed PLY",
-        "a compressed .ply",
-        (".compressed.ply",),
-        _PLY,
-        magic=(b"ply",),
-        write_seconds=9.0,
-        in_page=True,
+        "compressed PLY", "a compressed .ply", (".compressed.ply",), _PLY, magic=(b"ply",), in_page=True
     ),
     ModelFormat("PLY", "a .ply", (".ply",), _PLY, magic=(b"ply",), in_page=True, is_exact=True),
     ModelFormat(
-        "SPZ",
-        "an SPZ model",
-        (".spz",),
-        "spz:SpzCodes",
-        magic=(b"NGSP",),
-        archive=(b"\x1f\x8b",),
-        write_seconds=13.0,
-        in_page=True,
+        "SPZ", "an SPZ model", (".spz",), "spz:SpzCodes", (b"NGSP",), archive=(b"\x1f\x8b",), in_page=True
     ),
-    ModelFormat(
-        "SOG",
-        "an SOG model",
-        (".sog",),
-        "sog:SogCodes",
-        archive=(b"PK\x03\x04",),
-        write_seconds=9.0,
-        in_page=True,
-    ),
-    ModelFormat("glTF", "a glTF file", (".glb",), "glb", magic=(b"glTF",), write_seconds=5.0),
+    ModelFormat("SOG", "an SOG model", (".sog",), "sog:SogCodes", archive=(b"PK\x03\x04",), in_page=True),
+    ModelFormat("glTF", "a glTF file", (".glb",), "glb", magic=(b"glTF",)),
     ModelFormat(".splat", "a .splat model", (".splat",), "splat", in_page=True),
 )
 # Not a format of 3DGS models, so messages do not list it.

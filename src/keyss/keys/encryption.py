@@ -15,7 +15,6 @@ from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 from keyss.core.errors import InputError, UsageError
 from keyss.keys.derivation import expand
 
-DATA_KEY_BYTES = 32
 MAX_PAYLOAD_BYTES = 256 << 20  # before compression
 # A payload of more than MAX_RATIO n + SMALL_PAYLOAD bytes that compress to n is stored without compression.
 MAX_RATIO, SMALL_PAYLOAD = 16, 1 << 20
@@ -73,8 +72,6 @@ def decrypt(data_key: bytes, encrypted: bytes | memoryview, associated: bytes = 
 
 
 def _cipher(data_key: bytes) -> ChaCha20Poly1305:
-    if len(data_key) != DATA_KEY_BYTES:
-        raise ValueError(f"expected a data key of {DATA_KEY_BYTES} bytes, got {len(data_key)}")
     return ChaCha20Poly1305(expand(data_key, "payload", 32))
 
 

@@ -41,11 +41,7 @@ class AttributeDistance:
 
 
 def against_controls(
-    model: Gaussians,
-    controls: Sequence[Gaussians],
-    *,
-    original: Gaussians | None = None,
-    seed: int = 0,
+    model: Gaussians, controls: Sequence[Gaussians], *, original: Gaussians | None = None, seed: int = 0
 ) -> dict[str, AttributeDistance]:
     """`attribute_distances` of `model` and of `controls`, plain models of the same scene from other seeds.
 

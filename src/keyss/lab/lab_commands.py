@@ -169,11 +169,7 @@ def reproduce(
     table: Annotated[Positional[TableName], arg(help="Table of the paper.")],
     scenes: Annotated[
         Positional[tuple[Path, ...]],
-        arg(
-            metavar="[SCENE ...]",
-            help="Scenes; each hides the next one.",
-            help_behavior_hint="",
-        ),
+        arg(metavar="[SCENE ...]", help="Scenes; each hides the next one.", help_behavior_hint=""),
     ] = (),
     *,
     full: Annotated[

@@ -211,7 +211,6 @@ class Plan:
     sh_degree: int  # SH degree of the published model
     secret_gaussians: int  # total over the secrets
     capacity: int  # Gaussians of the secrets that fit at their SH degree
-    flat_capacity: int = 0  # that fit at SH degree 0, to which pruning may turn
     notes: tuple[str, ...] = ()  # sentences on the costs of options
 
     @property
@@ -228,8 +227,8 @@ class Plan:
     def room(self) -> str:
         """What fits, as a phrase."""
         rough = "about " if self.prunes else ""
-        flat = f", or {self.flat_capacity:,} of SH degree 0" if self.flat_capacity > self.capacity else ""
-        return f"room for {rough}{self.capacity:,} of the {self.secret_gaussians:,} Gaussians to hide{flat}"
+        more = "; of a lower SH degree, more fit" * self.prunes
+        return f"room for {rough}{self.capacity:,} of the {self.secret_gaussians:,} Gaussians to hide{more}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -40,7 +40,7 @@ class InterruptedRun:
 
     kind: str
     path: str
-    state: str  # how far it came, and what continues it
+    state: str  # what continues it
 
 
 @dataclass(frozen=True)
@@ -99,9 +99,7 @@ def _folder_info(path: Path, capacity: bool) -> RunInfo | InterruptedRun | Model
 
     manifest = read_manifest(path)
     if (running := manifest.running) is not None:
-        steps = _steps_done(path)
-        how = f"after {steps:,} training steps" if steps else "before a checkpoint was written"
-        state = f"interrupted {how}: the same command with --resume continues it, --overwrite drops it"
+        state = "interrupted: the same command with --resume continues it, --overwrite drops it"
         return InterruptedRun(f"unfinished {running.stage}", str(path), state)
     if inside := model_in(path):
         if not (path / METRICS).exists():  # hidden files have none, and `private/` may have been deleted
@@ -130,18 +128,6 @@ def _folder_info(path: Path, capacity: bool) -> RunInfo | InterruptedRun | Model
         extent=round(scene.extent, 4),
         background=_round(scene.background),
     )
-
-
-def _steps_done(run: Path) -> int:
-    """Training steps in the latest checkpoint of an interrupted run; 0 without a readable one."""
-    from keyss.fitting.loop import load_checkpoint
-    from keyss.runs.folder import CHECKPOINTS
-
-    files = sorted((run / CHECKPOINTS).glob("*.safetensors"), key=lambda file: file.stat().st_mtime)
-    try:
-        return int(load_checkpoint(files[-1])[1]["iteration"]) if files else 0
-    except InputError:
-        return 0
 
 
 def _model_info(path: Path, capacity: bool = False) -> ModelInfo:

@@ -11,7 +11,6 @@ from pathlib import Path
 
 from keyss.core.errors import InputError, KeyssWarning
 from keyss.files.file_kinds import model_file
-from keyss.files.model_formats import PLY, format_of
 from keyss.files.ply_table import is_plain, read_vertices
 
 _BYTES = 16  # per Gaussian of a compressed file
@@ -24,6 +23,8 @@ _SECONDS = {
     "reveal": 6.0,
     "hide a file": 20.0,
     "export": 1.0,
+    "convert": 12.0,
+    "convert, checking a key": 24.0,
     "render": 10.0,
     "prepare": 7.0,
 }
@@ -33,12 +34,6 @@ def seconds_for(task: str, *models: object) -> float:
     """About the seconds that a task takes, one of `_SECONDS`; folders of photos do not count."""
     paths = [Path(model) for model in models if isinstance(model, str | Path)]
     return _START + _SECONDS[task] * sum(map(gaussians_in, paths)) / 1e6
-
-
-def seconds_to_convert(model: Path, out: Path, keys: int) -> float:
-    """About the seconds to convert a model and to open its secrets before and after."""
-    per_million = (format_of(out) or PLY).write_seconds + 2 * keys * _SECONDS["reveal"]
-    return _START + per_million * gaussians_in(model) / 1e6
 
 
 def gaussians_in(path: Path) -> float:

@@ -56,9 +56,9 @@ class Manifest:
 class RunFolder:
     """A folder for the results of one stage, such as hiding, or an audit of a finished hiding.
 
-    `arguments`: JSON-able, must be equal to resume. `onto`: stages whose results stay; replacing those of
-    other stages needs `overwrite`. `writes`: known names of files to write; raises OutputError if others
-    wrote such files. `inputs`: files that are read and must not be replaced.
+    `arguments`: JSON-able, must be equal to resume. `onto`: stages whose results stay, perhaps its own;
+    replacing those of other stages needs `overwrite`. `writes`: known names of files to write; raises
+    OutputError if others wrote such files. `inputs`: files that are read and must not be replaced.
 
     Nothing is created before `work`. Raises OutputError if the folder is not empty without `overwrite` or
     `resume`, if it holds another run to resume, and if another process works in it; UsageError for both
@@ -219,7 +219,8 @@ class RunFolder:
         kept = {stage: names for stage, names in manifest.files.items() if stage in self.onto}
         _remove(self.path, self._files_to_replace(manifest))
         # List files before they appear, so that the manifest knows them after a crash.
-        manifest = replace(manifest, files=kept | {self.stage: tuple(self._names)})
+        names = dict.fromkeys((*kept.get(self.stage, ()), *self._names))
+        manifest = replace(manifest, files=kept | {self.stage: tuple(names)})
         self._save(manifest)
         try:
             for name in self._names:

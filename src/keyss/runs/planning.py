@@ -49,14 +49,10 @@ class Cost:
         """Whether to announce it."""
         return self.seconds > _LONG
 
-    @property
-    def where(self) -> str:
-        """The device, for messages."""
-        return "the GPU" if self.device == "cuda" else "the CPU"
-
     def __str__(self) -> str:
+        device = "the GPU" if self.device == "cuda" else "the CPU"
         return (
-            f"about {about(self.seconds)} on {self.where}, {self.memory_bytes / 1e9:.1f} GB of memory, "
+            f"about {about(self.seconds)} on {device}, {self.memory_bytes / 1e9:.1f} GB of memory, "
             f"up to {self.disk_bytes / 1e6:,.0f} MB of disk"
         )
 

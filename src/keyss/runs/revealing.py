@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,8 +51,8 @@ class Revealed:
         """Raise InputError if so little is left that renders would be nearly empty."""
         if self.file is None and self.recovered.share < MIN_LEFT:
             raise InputError(
-                f"{_count(self.recovered)}, too few to render (expected at least {MIN_LEFT:.0%}): the others "
-                f"{_CAUSE}; use the file as it was published"
+                f"{count_of(self.recovered)}, too few to render (expected at least {MIN_LEFT:.0%}): the "
+                f"others {_CAUSE}; use the file as it was published"
             )
 
 
@@ -92,11 +91,11 @@ def loss_warnings(recovered: Recovered) -> list[str]:
     """Warnings about an incomplete secret."""
     if recovered.share < 1 - NOTICED_LOSS:
         return [
-            f"{_count(recovered)}: the others {_CAUSE}; the rest was made larger and denser to compensate; "
+            f"{count_of(recovered)}: the others {_CAUSE}; the rest was made larger and denser to compensate; "
             "the file as it was published gives the whole secret"
         ]
     if recovered.share > 1 + NOTICED_LOSS:
-        return [f"{_count(recovered)}: Gaussians were copied or changed in the published file"]
+        return [f"{count_of(recovered)}: Gaussians were copied or changed in the published file"]
     left, shards = recovered.shards or (0, 0)
     if left < shards:
         return [
@@ -106,7 +105,8 @@ def loss_warnings(recovered: Recovered) -> list[str]:
     return []
 
 
-def _count(recovered: Recovered) -> str:
+def count_of(recovered: Recovered) -> str:
+    """A sentence on the Gaussians that are left."""
     if not recovered.hidden:
         return f"{recovered.found:,} Gaussians of the secret were found"
     return f"{recovered.found:,} of {recovered.hidden:,} Gaussians of the secret were found"
@@ -128,7 +128,6 @@ class ModelCheck:
     gaussians: int
     sh_degree: int
     duplicates: int  # visible Gaussians with the position and the red of another
-    unit_quaternions: float  # share with length 1; others are valid too
     no_rotation: int  # quaternions of length 0
     far: int  # Gaussians a thousand times as far out as visible ones
     enormous: int  # visible Gaussians a hundred times as large as the visible part
@@ -143,9 +142,6 @@ class SecretCheck:
     found: int
     hidden: int  # 0: unknown
     unit: str  # unit of `found` and `hidden`: Gaussians, or bytes of a hidden file
-    share: float  # found / hidden
-    shards: int | None  # shards of the payload; None if it is not divided
-    shards_lost: int | None  # restored by error correction
     problems: tuple[str, ...]
 
 
@@ -170,12 +166,11 @@ def check_model(model: Gaussians) -> ModelCheck:
     means = (model.means[seen[:: max(1, len(seen) // _SAMPLE)]] if len(seen) else model.means).double()
     middle = means.median(0).values
     radius = max(1e-6, float((means - middle).norm(dim=1).sort().values[int(0.9 * len(means))]))
-    lengths = model.quats.double().norm(dim=1)
     harmonics = model.sh.flatten(1)
     duplicates, suspicious = copies(model)
     counts = {
         "duplicates": duplicates,
-        "no_rotation": int((lengths < _MIN_QUATERNION).sum()),
+        "no_rotation": int((model.quats.double().norm(dim=1) < _MIN_QUATERNION).sum()),
         "far": int(((model.means - middle).double().norm(dim=1) > _FAR * radius).sum()),
         "enormous": int((visible & (model.log_scales.amax(1).double().exp() > _ENORMOUS * radius)).sum()),
         "out_of_range": int((torch.maximum(harmonics.amax(1), -harmonics.amin(1)) > _MAX_HARMONIC).sum()),
@@ -184,27 +179,4 @@ def check_model(model: Gaussians) -> ModelCheck:
     problems = [f"{count:,} Gaussians {_PROBLEMS[name]}" for name, count in wrong.items() if count]
     if not visible.any():
         problems.append("all Gaussians are invisible")
-    return ModelCheck(
-        gaussians=len(model),
-        sh_degree=model.sh_degree,
-        unit_quaternions=round(float(((lengths - 1).abs() < 1e-3).double().mean()), 4),
-        problems=tuple(problems),
-        **counts,
-    )
-
-
-def check_secret(revealed: Revealed, warned: Sequence[str] = ()) -> SecretCheck:
-    """Count what is missing of a revealed secret; `warned`: what opening it warned of."""
-    recovered = revealed.recovered
-    problems = [*warned, *revealed.warnings]
-    if revealed.file is None and not recovered.whole and not problems:
-        problems.append(_count(recovered))
-    return SecretCheck(
-        found=recovered.found,
-        hidden=recovered.hidden,
-        unit="Gaussians" if revealed.file is None else "bytes",
-        share=round(recovered.share, 4),
-        shards=recovered.shards and recovered.shards[1],
-        shards_lost=recovered.shards and recovered.shards[1] - recovered.shards[0],
-        problems=tuple(problems),
-    )
+    return ModelCheck(len(model), model.sh_degree, **counts, problems=tuple(problems))

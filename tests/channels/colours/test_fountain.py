@@ -55,8 +55,3 @@ def test_a_long_code_needs_a_quarter_more_than_capacity(errors: float) -> None:
     code, data, seeds = Fountain(size), _random_bits(size, 1), _seeds(int(1.25 * size / capacity))
     found = code.decode(seeds, _noisy(code.encode(data, seeds), errors, 2))
     assert (found == data).all()
-
-
-def test_bits_of_the_wrong_number_are_refused() -> None:
-    with pytest.raises(ValueError, match="expected 40 bits"):
-        Fountain(40).encode(_random_bits(41, 0), _seeds(9))

@@ -1,53 +1,57 @@
-"""What the holder of one key sees of a file: which rows open, and where they lie.
-
-Not only what a reader returns: the holder of a key and of the source can look at every row.
-"""
+"""What the holder of one key, and of the source, can count in a file beyond what a reader returns."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
-import pytest
 
-from keyss.channels import LowBitsReader, Message, Payload, Shards
+from keyss.channels import (
+    LEAST,
+    Layout,
+    LowBitsReader,
+    Message,
+    Parameters,
+    Shards,
+    gaussian_ids,
+    read_low_bits,
+)
+from keyss.channels.container import key_secret
+from keyss.channels.lsb.low_bits_capacity import codewords_of, key_message, parameter_message
+from keyss.channels.lsb.shards import is_tagged
 from keyss.core import Gaussians
+from keyss.core.arrays import Bytes
 from keyss.keys import DerivedKey
 
 
-def seen_by_holder(stego: Gaussians, key: DerivedKey) -> dict[str, float]:
-    """Numbers of rows of messages and shards, and how they lie in the file."""
-    payload, messages, shards = _opened(stego, key)
-    where = np.flatnonzero(shards)
-    found = {f"rows of message {index}": float(each) for index, each in enumerate(messages)}
-    found["rows with shards"] = float(shards.mean())
-    found["middle of the rows with shards"] = float(where.mean() / len(stego))
-    found["spread of the rows with shards"] = float(where.std() / len(stego))
-    if payload.shards is not None:
-        found["shards"], found["shards that there were"] = map(float, payload.shards)
-    return found
+def seen_by_holder(stego: Gaussians, key: str) -> dict[str, float]:
+    """Numbers of rows of messages and shards, how they lie in the file, and the other low bits."""
+    layout, salts = Layout.of(stego), LowBitsReader.of(stego).salts
+    ids, low = gaussian_ids(stego, layout), read_low_bits(stego, LEAST, layout)
+    for salt in salts:
+        message = key_message(key_secret(DerivedKey.of(key, salt)), low.shape[1])
+        data_key, key_rows = _read(message, ids, low)
+        packed, parameter_rows = _read(parameter_message(data_key, low.shape[1]), ids, low)
+        if (parameters := Parameters.unpack(packed, data_key)) is not None:  # else the salt is stale
+            break
+    assert parameters is not None
+    codewords, rows = codewords_of(parameters, layout), read_low_bits(stego, parameters.depth, layout)
+    own, numbers, _ = Shards(data_key, codewords, is_tagged(rows.shape[1])).decrypt(ids, rows)
+    where = np.flatnonzero(own)
+    return {
+        "rows of the data key": float(key_rows),
+        "rows of the parameters": float(parameter_rows),
+        "rows with shards": float(own.mean()),
+        "middle of the rows with shards": float(where.mean() / len(stego)),
+        "spread of the rows with shards": float(where.std() / len(stego)),
+        "gaps between rows with shards": float(np.diff(where).var()),
+        "next rows with shards": float((own[1:] & own[:-1]).sum()),
+        "mean of the other low bits": float(low[~own].mean()),
+        "shards": float(len(np.unique(numbers))),
+        "shards that there were": float(codewords.shards),
+    }
 
 
-def _opened(stego: Gaussians, key: DerivedKey) -> tuple[Payload, list[int], npt.NDArray[np.bool_]]:
-    """The payload, places of each message that hold it, and which Gaussians seem to hold shards."""
-    messages: list[int] = []
-    shards: list[npt.NDArray[np.bool_]] = []
-    read, decrypt = Message.read, Shards.decrypt
-
-    def read_message(self: Message, ids: Any, low: Any) -> bytes:
-        data = read(self, ids, low)
-        rows, contents = self.write(ids, data)
-        messages.append(int((low(rows)[:, : self.width] == contents).all(axis=1).sum()))
-        return data
-
-    def decrypt_shards(self: Shards, ids: Any, low: Any) -> Any:
-        found = decrypt(self, ids, low)
-        shards.append(found[0])
-        return found
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Message, "read", read_message)
-        patch.setattr(Shards, "decrypt", decrypt_shards)
-        payload = LowBitsReader.of(stego).extract(key)
-    return payload, messages, shards[0]
+def _read(message: Message, ids: Bytes, low: Bytes) -> tuple[bytes, int]:
+    """The data of a message, and the number of its places that hold them."""
+    data = message.read(ids, low.__getitem__)
+    rows, contents = message.write(ids, data)
+    return data, int((low[rows, : message.width] == contents).all(axis=1).sum())

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as arrays
 
 from keyss.channels import DEPTHS, Layout, gaussian_ids, read_low_bits, used_words, write_low_bits
 from keyss.core import Gaussians
-from keyss.core.arrays import repeated
+from keyss.core.arrays import frequent, repeated
 from keyss.kernels.parallel import in_blocks
 
 SHAPES = ((3,), (4,), (3,), ())
@@ -82,11 +82,12 @@ def test_low_bits_are_read_and_written_as_the_format_says(
     assert (written.means.view(torch.int32) == model.means.view(torch.int32)).all()
 
 
-@given(arrays.arrays(np.uint64, st.integers(0, 300), elements=st.integers(0, 40)), st.integers(0, 60))
-def test_what_occurs_twice_is_found_whatever_it_is(values: np.ndarray, shift: int) -> None:
-    values = values << np.uint64(shift)
-    times = {value: int((values == value).sum()) for value in values.tolist()}
-    assert repeated(values).tolist() == [times[value] > 1 for value in values.tolist()]
+@given(st.lists(st.integers(0, 40), max_size=90), st.integers(1, 5), st.sampled_from([np.uint32, np.uint64]))
+def test_frequent_values_are_those_that_counting_finds(values: list[int], times: int, kind: type) -> None:
+    words = np.array(values, kind) << kind(20)
+    found, counts = np.unique(words, return_counts=True)
+    assert np.array_equal(frequent(words[:, None], times), found[counts >= times])
+    assert np.array_equal(repeated(words), np.isin(words, found[counts > 1]))
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])

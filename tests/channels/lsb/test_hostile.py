@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from channels.lsb.payloads import embed_payloads
+from channels.lsb.payloads import embed, extract
 from channels.lsb.quantised import FORMATS, codes_of, opened, written
-from channels.lsb.trained_like import keys, trained_like
+from channels.lsb.trained_like import trained_like
 from files.formats.examples import KINDS, random_codes
-from keyss.channels import LOW_BITS, Codewords, LowBitsReader, Parameters, Payload, QuantisedCover, container
+from keyss.channels import Codewords, LowBitsReader, Parameters, QuantisedCover, container
 from keyss.channels.lsb.low_bits_capacity import MAX_CODEWORDS
 from keyss.channels.reed_solomon import MAX_SHARDS
 from keyss.core import Gaussians, InputError, UsageError, WrongKeyError
@@ -130,10 +130,10 @@ def test_hostile_parameters_end_in_a_sentence(
     hostile = Parameters(depth, count, n, k)
     with monkeypatch.context() as patch:
         patch.setattr(container, "Parameters", lambda *_: hostile)
-        stego = embed_payloads(LOW_BITS.prepare(cover), [(keys(), Payload("carry", b"x"))])
+        stego = embed(cover, [("a key", b"x")])
     reader = LowBitsReader.of(stego)
     with at_most(10), pytest.raises(InputError, match=r"the key is right|are damaged"):
-        reader.extract(keys()[0])
+        reader.open("a key")
 
 
 @pytest.mark.parametrize("version", [0, 2, 255])
@@ -142,9 +142,9 @@ def test_other_versions_end_in_a_sentence(
 ) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(container, "_VERSION", version)
-        stego = embed_payloads(LOW_BITS.prepare(cover), [(keys(), Payload("carry", b"x"))])
+        stego = embed(cover, [("a key", b"x")])
     with pytest.raises(
         InputError,
         match=f"of version {version}; this program reads version 1: {'update' if version else 'open'}",
     ):
-        LowBitsReader.of(stego).extract(keys()[0])
+        extract(stego, "a key")

@@ -6,9 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from keyss.channels.lsb.salts import SALTS
 from keyss.core import Gaussians
-from keyss.keys import DerivedKey
 
 
 def trained_like(count: int, seed: int = 0, sh_degree: int = 3) -> Gaussians:
@@ -40,13 +38,6 @@ def rounded(model: Gaussians, seed: int = 0, step: float = 4e-5) -> Gaussians:
     generator = torch.Generator().manual_seed(seed)
     steps = (step * torch.randn(model.sh[:, 1:].shape, generator=generator, dtype=torch.float64)).float()
     return replace(model, sh=torch.cat([model.sh[:, :1], (model.sh[:, 1:] + steps) - steps], dim=1))
-
-
-def keys(seed: int = 0) -> list[DerivedKey]:
-    """A key under every salt, without Argon2id: its output is replaced by random bytes."""
-    generator = torch.Generator().manual_seed(10_000 + seed)
-    numbers = torch.randint(256, (SALTS, 32), generator=generator, dtype=torch.uint8)
-    return [DerivedKey(row.numpy().tobytes()) for row in numbers]
 
 
 def _half_precision(model: Gaussians) -> Gaussians:

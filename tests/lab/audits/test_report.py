@@ -40,7 +40,7 @@ def test_numbers_and_pictures_of_every_part(run_folder: Path) -> None:
     ]
     assert [text for text in shown if text not in report] == []
     files = PICTURE.findall(report)
-    assert len(files) > 10
+    assert len(files) == 3 + 2  # scenes, and attacks on secrets
     for file in files:
         with Image.open(run_folder / "private" / file) as picture:
             picture.verify()

@@ -19,6 +19,9 @@ from keyss.core import InputError, OutputError, UsageError, WrongKeyError
 from keyss.files import read_model
 from keyss.lab import measure_render_time, render_time
 from keyss.lab.audits import PARTS, Section, audit, read_audit
+from keyss.lab.audits.audit_run import AUDIT, PICTURES
+from keyss.runs import read_manifest
+from keyss.runs.files import REPORT
 from lab.audits.audited import KEYS
 from test_api import ANY, write_nerfstudio
 from tiny_scenes import random_gaussians, tiny_scene
@@ -74,31 +77,27 @@ def test_results_of_parts_are_written(run: Path, calls: list[str]) -> None:
     assert KEY not in (run / "private" / "audit" / "audit.json").read_text()
 
 
-def test_resume(run: Path, calls: list[str]) -> None:
+def test_parts_are_measured_once(run: Path, calls: list[str]) -> None:
     calls.append("fail")
-    with pytest.raises(KeyboardInterrupt):
-        audit(run, [KEY], controls=2)
     with pytest.raises(InputError, match=r"there is no audit; `keyss audit .* makes one"):
         read_audit(run)
-    with pytest.raises(OutputError, match="controls: 2 then, 3 now"):
+    with pytest.raises(KeyboardInterrupt):
+        audit(run, [KEY], controls=2)
+    assert list(read_audit(run).sections) == ["speed"]
+    with pytest.raises(OutputError, match="other controls: `overwrite=True` replaces it"):
         audit(run, [KEY], controls=3)
+    assert list(audit(run, [KEY], controls=2).sections) == ["speed", "leaks"]
     found = audit(run, [KEY], controls=2)
     assert calls == ["fail", "speed", "leaks", "leaks"]
-    assert found.sections["speed"].numbers["gaussians"] > 0
-    assert (run / "private" / "audit" / "pictures" / "speed-1.png").exists()
-
-
-def test_parts_are_added(run: Path, calls: list[str]) -> None:
-    audit(run, [KEY], controls=2, only=["speed"])
-    with pytest.raises(OutputError, match="`overwrite=True` replaces it"):
-        audit(run, [KEY], controls=2, only=["speed"])
-    audit(run, [KEY], controls=2, only=["leaks"])
-    found = audit(run, [KEY], controls=2, only=["leaks"], overwrite=True)
-    assert calls == ["speed", "leaks", "leaks"]
-    assert list(read_audit(run).sections) == list(found.sections) == ["speed", "leaks"]
-    assert (run / "private" / "audit" / "pictures" / "speed-1.png").exists()
-    with pytest.raises(OutputError, match="`overwrite=True` replaces it"):
-        audit(run, [KEY], controls=3, only=["leaks"])
+    assert audit(run, [KEY], controls=2, only=["speed"], overwrite=True).sections == found.sections
+    assert calls[4:] == ["speed"]
+    names = read_manifest(run).files["audit"]
+    assert sorted(names) == sorted({AUDIT, REPORT, f"{PICTURES}/speed-1.png"})
+    assert all((run / name).exists() for name in names)
+    (run / AUDIT).write_text("{}")
+    with pytest.raises(InputError, match="expected"):
+        audit(run, [KEY], controls=2)
+    assert list(audit(run, [KEY], controls=3, only=["leaks"], overwrite=True).sections) == ["leaks"]
 
 
 def test_invalid_arguments(run: Path, tmp_path: Path, calls: list[str]) -> None:

@@ -145,10 +145,7 @@ def test_trials_run_once(tmp_path: Path) -> None:
         scenes = list(csv.DictReader(file))
     assert [
         (row["scene"], row["role"], row["psnr"], row["psnr_std"], row["lpips"]) for row in scenes[:2]
-    ] == [
-        ("a", "cover", "31.0", "1.0", ""),
-        ("secret", "secret", "20.0", "0.0", ""),
-    ]
+    ] == [("a", "cover", "31.0", "1.0", ""), ("secret", "secret", "20.0", "0.0", "")]
     assert "seconds" not in (tmp_path / "out" / "trials.csv").read_text()  # they differ from run to run
 
 

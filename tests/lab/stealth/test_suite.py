@@ -22,6 +22,7 @@ from lab.stealth.careless import (
     shuffled,
     with_siblings,
 )
+from methods.carry.carried import embed
 
 ALARM = 1e-6  # probability of a false alarm
 
@@ -63,10 +64,7 @@ def of_plain(seed: int) -> dict[str, Statistic]:
         ),
         (
             lambda seed: normalised(plain(seed)),
-            (
-                "invariants: quaternions of unit length",
-                "invariants: quaternions of nearly unit length",
-            ),
+            ("invariants: quaternions of unit length", "invariants: quaternions of nearly unit length"),
         ),
     ],
     ids=["rounded", "grey", "siblings", "normalised"],
@@ -84,9 +82,10 @@ def test_overwritten_relations_are_detected(
         assert z(before[name], other[name]) < 4.5, name
 
 
-def test_overwritten_random_bits_are_not_detected() -> None:
-    """The control: the same change where bits were random before."""
-    before, after = of_plain(1), stealth_statistics(overwritten(plain(1)))
+@pytest.mark.parametrize("change", [overwritten, lambda model: embed(model, [("a key", plain(2, 800))])])
+def test_new_random_bits_are_not_detected(change: Callable[[Gaussians], Gaussians]) -> None:
+    """The control: careless changes, and a hidden model, where bits were random before."""
+    before, after = of_plain(1), stealth_statistics(change(plain(1)))
     for name in before:
         one, two = before[name], after[name]
         if one.error:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from channels.lsb.payloads import embed_payloads
 from keyss.channels import LOW_BITS, LowBitsReader, Payload
 from keyss.core import Gaussians
-from keyss.keys import DerivedKey
 from keyss.methods import CarriedSecret
 from keyss.methods.codec.model_bytes import encode
 
@@ -19,18 +17,5 @@ def embed(
     return LOW_BITS.prepare(cover).embed(payloads, entropy=entropy)
 
 
-def embed_derived(
-    cover: Gaussians,
-    secrets: Sequence[tuple[Sequence[DerivedKey], Gaussians]],
-    entropy: bytes | None = None,
-) -> Gaussians:
-    payloads = [(keys, Payload("carry", encode(model))) for keys, model in secrets]
-    return embed_payloads(LOW_BITS.prepare(cover), payloads, entropy)
-
-
 def extract(stego: Gaussians, key: str) -> CarriedSecret:
     return CarriedSecret.of(LowBitsReader.of(stego).open(key))
-
-
-def extract_derived(reader: LowBitsReader, key: DerivedKey) -> CarriedSecret:
-    return CarriedSecret.of(reader.extract(key))

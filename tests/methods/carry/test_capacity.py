@@ -12,10 +12,11 @@ import torch
 from channels.lsb.trained_like import trained_like
 from keyss import CarryOptions, FitConfig, Gaussians
 from keyss.channels import LOW_BITS, Layout, LowBitsCapacity, Payload, sealed_size
+from keyss.channels.appended import appended_channel
 from keyss.channels.foreign import EXACT_BYTES
 from keyss.core import KeyssWarning, UsageError
 from keyss.methods import Context, Prepared, Source, registry
-from keyss.methods.carry.capacity import CarryCapacity
+from keyss.methods.carry.carry_method import CarryCapacity
 from keyss.rendering import Viewpoints, scene_of_model
 
 KEY = "a key of many characters: 93hXmQ2"
@@ -83,3 +84,10 @@ def test_pruning_for_other_secrets_warns() -> None:
     assert len(alone) == 4000
     with pytest.warns(KeyssWarning, match="can notice that there are other secrets"):
         assert len(capacity.prune(models, views)[0]) < 4000
+
+
+def test_secret_too_large_to_append(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(appended_channel, "MAX_BYTES", 20_000)
+    with pytest.raises(UsageError, match=r"bytes, and [0-9,]+ can be appended; fewer Gaussians"):
+        _prepare(CarryOptions(publish="converted"), trained_like(500), trained_like(4000, 1))
+    _prepare(CarryOptions(publish="converted"), trained_like(500), trained_like(600, 1))

@@ -4,7 +4,7 @@
  */
 import { ascii, bytesKey, joined, viewOf } from '../core/bytes.ts';
 import { damaged, InputError, otherVersion } from '../core/errors.ts';
-import { decrypted, type Derive, expand, streamWords } from '../keys/keys.ts';
+import { decrypted, type Derive, expand, here, streamWords } from '../keys/keys.ts';
 import { type Codewords, decoded, type Shards } from './reed_solomon.ts';
 
 /** Bytes that are read completely or not at all. */
@@ -28,6 +28,22 @@ const METHOD_BYTES = 15;
 const VERSION = 1;
 const CHECK_BYTES = 8;
 export const PARAMETER_BYTES = CHECK_BYTES + 10;
+
+/** Tries a key with all `salts`, whatever it opens; `extract`: the payload under the secret of a key and one salt, or null. */
+export function saltedReader(salts: readonly Uint8Array[], extract: (secret: Uint8Array) => Promise<Payload | null>): Reader {
+  return {
+    derivations: salts.length,
+    async open(key, derive = here) {
+      const masters = salts.map((salt) => derive(key, salt)); // in other workers, while this one reads
+      let found: Payload | null = null;
+      for (const each of masters) {
+        const secret = keySecret(await each);
+        found ??= await extract(secret);
+      }
+      return found;
+    },
+  };
+}
 
 /** What a key under a salt decrypts with. It is the data key of a file with one salt. */
 export function keySecret(master: Uint8Array): Uint8Array {

@@ -17,34 +17,13 @@ import numpy as np
 import torch
 
 from keyss.channels import container
-from keyss.channels.appended import pilots
-from keyss.channels.appended.words import (
-    HEADERS,
-    WORD_BITS,
-    all_shifts,
-    candidate_mask,
-    check_place,
-    colours_of,
-    invariants_of,
-    likely_shifts,
-    own_frame,
-    pack_words,
-    points_in_frame,
-    read_header,
-    read_packets,
-    scale_steps,
-    scales_at,
-    sort_by_rotation,
-    to_gaussians,
-    write_header,
-    write_packets,
-)
+from keyss.channels.appended import pilots, words
 from keyss.channels.base import Capacity, Channel
 from keyss.channels.container import Payload, SaltedReader
 from keyss.channels.foreign import COARSE_BYTES, coarse_foreign, coarse_record
 from keyss.channels.mixing import random_order
 from keyss.channels.reed_solomon import Codewords
-from keyss.core.arrays import Bits, Doubles, Integers
+from keyss.core.arrays import Bits, Doubles, Integers, doubles
 from keyss.core.errors import UsageError, WrongKeyError
 from keyss.core.gaussians import Gaussians
 from keyss.core.similarity import Similarity
@@ -69,44 +48,26 @@ _VISIBLE_SECRETS = (
 )
 
 
-class Appended(Channel):
-    """The channel; see `keyss.channels.base.Channel`."""
-
-    place = "appended Gaussians"
-    survives = True
-    grows = True
-
-    def prepare(self, cover: Gaussians) -> AppendedCover:
-        """See `Channel`. Raises UsageError for a cover too far from the origin for float32."""
-        check_place(own_frame(cover))
-        return AppendedCover(cover)
-
-    def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
-        shares = [(1.0, MAX_BYTES)]
-        return Capacity.of_sealed(_OVERHEAD, shares, lambda count: MAX_BYTES // count, grows=True)
-
-    def appended_count(self, sizes: Sequence[int]) -> int:
-        """The number of Gaussians appended for payloads of these bytes of compressed data, at most."""
-        return _padded_count([_codewords_for(size + _OVERHEAD, len(sizes)) for size in sizes])
-
-
-APPENDED = Appended()
-
-
 @dataclass(frozen=True)
 class AppendedCover:
     """Any cover; see `keyss.channels.base.PreparedCover`."""
 
     cover: Gaussians
 
+    @staticmethod
+    def of(cover: Gaussians) -> AppendedCover:
+        """Raises UsageError for a cover too far from the origin for float32."""
+        words.check_place(words.own_frame(cover))
+        return AppendedCover(cover)
+
     @property
     def capacity(self) -> Capacity:
-        return APPENDED.estimate_capacity(len(self.cover), self.cover.sh_degree)
+        return _capacity(len(self.cover), self.cover.sh_degree)
 
     def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
         """The cover followed by the appended Gaussians. Warns if there is more than one secret."""
         model = self.cover.detach().to("cpu")
-        to_world = own_frame(model)
+        to_world = words.own_frame(model)
         secret = container.randomness(entropy, [payload for _, payload in payloads])
         salt = expand(secret, "appended/salt", SALT_BYTES)
         random = np.random.default_rng(np.frombuffer(stream(secret, "appended/random", 32), np.uint32))
@@ -117,15 +78,31 @@ class AppendedCover:
         sizes = [container.sealed_size(payload, COARSE_BYTES) for _, payload in payloads]
         every = [_codewords_for(size, len(sizes)) for size in sizes]
         total = _padded_count(every)
-        words = [pilots.write(salt, pilots.count_for(total), random)]
+        parts = [pilots.write(salt, pilots.count_for(total), random)]
         for data_key, (_, payload), codewords in zip(keys, payloads, every, strict=True):
             record = coarse_record(data_key, model, total, to_world.inverse())
             sealed = container.seal(data_key, payload, codewords.size, record)
-            words.append(_words(data_key, codewords, sealed))
-        words.append(_random_words(secret, total - sum(map(len, words))))
+            parts.append(_words(data_key, codewords, sealed))
+        missing = total - sum(map(len, parts))
+        noise = np.frombuffer(stream(secret, "appended/padding", missing * words.WORD_BITS), np.uint8)
+        parts.append((noise & np.uint8(1)).reshape(missing, words.WORD_BITS))
         # In random order, because sorting keeps the order of equal rotations.
-        ordered = np.concatenate(words)[random_order(secret, "appended/order", total)]
-        return Gaussians.cat([model, to_gaussians(sort_by_rotation(ordered), to_world, model.sh_degree)])
+        ordered = np.concatenate(parts)[random_order(secret, "appended/order", total)]
+        added = words.to_gaussians(words.sort_by_rotation(ordered), to_world, model.sh_degree)
+        return Gaussians.cat([model, added])
+
+
+def _capacity(gaussians: int, sh_degree: int) -> Capacity:
+    """The same for all covers."""
+    return Capacity.of_sealed(_OVERHEAD, [(1.0, MAX_BYTES)], lambda count: MAX_BYTES // count, grows=True)
+
+
+APPENDED = Channel("appended Gaussians", AppendedCover.of, _capacity, survives=True, grows=True)
+
+
+def appended_count(sizes: Sequence[int]) -> int:
+    """The number of Gaussians appended for payloads of these bytes of compressed data, at most."""
+    return _padded_count([_codewords_for(size + _OVERHEAD, len(sizes)) for size in sizes])
 
 
 @dataclass(frozen=True)
@@ -140,32 +117,33 @@ class AppendedReader(SaltedReader):
     @staticmethod
     def of(model: Gaussians) -> AppendedReader | None:
         """None if there are none, or if their frame cannot be found."""
-        candidates = candidate_mask(model)
+        candidates = words.candidate_mask(model)
         if candidates.sum() < pilots.MIN // 4:
             return None
         faint = model.detach().to("cpu")[torch.from_numpy(candidates)]
-        colours, steps = colours_of(faint), scale_steps(faint)
+        colours, steps = words.colours_of(faint), doubles(faint.log_scales) / words.SCALE_STEP
         few = np.random.default_rng(0).permutation(len(faint))[:_SAMPLE]
-        for shifts in (likely_shifts(steps), _shifts_with_pilots(steps[few], colours[few])):
+        for shifts in (words.likely_shifts(steps), _shifts_with_pilots(steps[few], colours[few])):
             best: tuple[pilots.PilotFit, Integers] | None = None
             for shift in shifts:
-                scales = scales_at(steps, shift)
-                pilot_frame = pilots.read(invariants_of(colours, scales), faint.means.double().numpy())
+                scales = words.scales_at(steps, shift)
+                pilot_frame = pilots.read(words.invariants_of(colours, scales), faint.means.double().numpy())
                 if pilot_frame and (best is None or pilot_frame.inliers > best[0].inliers):
                     best = pilot_frame, scales
             if best is not None:
                 pilot_frame, scales = best
-                words = pack_words(colours, scales, *points_in_frame(faint, pilot_frame.to_own))
-                return AppendedReader([pilot_frame.salt], words, model.detach().to("cpu"), pilot_frame.to_own)
+                to_own, salts = pilot_frame.to_own, [pilot_frame.salt]
+                packed = words.pack_words(colours, scales, *words.points_in_frame(faint, to_own))
+                return AppendedReader(salts, packed, model.detach().to("cpu"), to_own)
         return None
 
     def extract(self, key: DerivedKey) -> Payload:
         """See `SaltedReader`."""
         data_key = container.key_secret(key)
         for width in (_WIDE, _NARROW):
-            needed = read_header(expand(data_key, f"header/{width}", 32), self.words, width)
+            needed = words.read_header(expand(data_key, f"header/{width}", 32), self.words, width)
             if needed:
-                numbers, data = read_packets(expand(data_key, "packets", 32), self.words, width)
+                numbers, data = words.read_packets(expand(data_key, "packets", 32), self.words, width)
                 codewords = _codewords(needed, width)
                 shards = numbers.astype(np.int64), data
                 record, payload = container.unseal_shards(data_key, codewords, *shards, COARSE_BYTES)
@@ -182,7 +160,7 @@ def _bucket(size: int) -> int:
 
 def _padded_count(every: Sequence[Codewords]) -> int:
     """The number of Gaussians to append for payloads in these codewords: one of few, which reveal little."""
-    used = sum(HEADERS + layout.shards for layout in every)
+    used = sum(words.HEADERS + layout.shards for layout in every)
     total = _bucket(used)
     while total - pilots.count_for(total) < used:
         total = _bucket(total + 1)
@@ -209,8 +187,9 @@ def _codewords(needed: int, width: int) -> Codewords:
 
 def _shifts_with_pilots(steps: Doubles, colours: Integers) -> Iterator[float]:
     """Offsets of the lattice of log scales with significantly many pilots, most first."""
-    shifts = all_shifts(steps)
-    counts = np.array([pilots.count(invariants_of(colours, scales_at(steps, shift))) for shift in shifts])
+    shifts = words.all_shifts(steps)
+    found = (pilots.find(words.invariants_of(colours, words.scales_at(steps, shift))) for shift in shifts)
+    counts = np.array([*map(len, found)])
     expected = len(steps) / pilots.ONE_IN
     for index in np.argsort(counts)[::-1][:_MAX_OFFSETS]:
         if counts[index] > expected + _SIGNIFICANT * math.sqrt(expected):
@@ -218,20 +197,10 @@ def _shifts_with_pilots(steps: Doubles, colours: Integers) -> Iterator[float]:
 
 
 def _words(data_key: bytes, codewords: Codewords, sealed: bytes) -> Bits:
-    """Words [N, WORD_BITS] of the headers and packets of a sealed payload."""
-    width, needed = codewords.width, codewords.count * codewords.k
-    noise = np.frombuffer(stream(data_key, "header-noise", HEADERS * width), np.uint8)
+    """Words [N, WORD_BITS] of the headers, with noise as data, and packets of a sealed payload."""
+    width, needed = codewords.width, np.full(words.HEADERS, codewords.count * codewords.k, np.uint64)
+    noise = np.frombuffer(stream(data_key, "header-noise", words.HEADERS * width), np.uint8)
+    header_key, key = expand(data_key, f"header/{width}", 32), expand(data_key, "packets", 32)
+    headers = words.write_packets(header_key, needed, noise.reshape(words.HEADERS, width))
     numbers = np.arange(codewords.shards, dtype=np.uint64)
-    return np.concatenate(
-        [
-            write_header(expand(data_key, f"header/{width}", 32), needed, noise.reshape(HEADERS, width)),
-            write_packets(expand(data_key, "packets", 32), numbers, codewords.encode(sealed)),
-        ]
-    )
-
-
-def _random_words(secret: bytes, count: int) -> Bits:
-    """Words [count, WORD_BITS] as random as encrypted ones."""
-    noise = np.frombuffer(stream(secret, "appended/padding", count * WORD_BITS), np.uint8)
-    bits: Bits = (noise & np.uint8(1)).reshape(count, WORD_BITS)
-    return bits
+    return np.concatenate([headers, words.write_packets(key, numbers, codewords.encode(sealed))])

@@ -73,18 +73,13 @@ def write(salt: bytes, count: int, random: np.random.Generator) -> Bits:
     return np.concatenate([bits_of(pilots, INVARIANT_BITS), others], axis=1)
 
 
-def count(invariants: Words) -> int:
-    """The number of different pilots among words with `invariants` [N]."""
-    return len(_pilots(invariants))
-
-
 def read(invariants: Words, means: Doubles) -> PilotFit | None:
     """Fit the pilots among candidates with `invariants` [N] and `means` [N, 3] in the world.
 
     None if too few agree.
     """
     random = np.random.default_rng(0)
-    pilots = _pilots(invariants)
+    pilots = find(invariants)
     if len(pilots) < _MIN_INLIERS:
         return None
     places = mix(mix(invariants[pilots] ^ _PUBLIC))
@@ -155,8 +150,8 @@ def _salt(invariants: Words) -> bytes | None:
     return b"".join(counter.most_common(1)[0][0].to_bytes(2, "big") for counter in votes)
 
 
-def _pilots(invariants: Words) -> Integers:
-    """Rows of different pilots; copies of one faint Gaussian would outnumber the others."""
+def find(invariants: Words) -> Integers:
+    """Rows of different pilots among `invariants` [N]; copies of one would outnumber the others."""
     places = np.flatnonzero(_is_pilot(invariants))
     return places[np.sort(np.unique(invariants[places], return_index=True)[1])]
 

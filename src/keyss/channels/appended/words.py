@@ -38,7 +38,7 @@ _OPACITY = 1.00001 * DRAWN_OPACITY
 _LOGIT = math.log(_OPACITY / (1 - _OPACITY))
 _FAINTEST, _STRONGEST = 0.4 * DRAWN_OPACITY, 1.6 * DRAWN_OPACITY  # opacities of words after rounding
 _COLOUR_STEP = 0.0275  # a little above twice the largest rounding error of formats
-_SCALE_STEP = 0.08  # of log scales; also above twice the largest rounding error
+SCALE_STEP = 0.08  # of log scales; also above twice the largest rounding error
 _MIN_LOG_SCALE = -9.9  # `.spz` stores -10 and more
 _SMALL = -9.0  # smallest log scale, relative to the cube's
 # Bound of x, y and z, so that w is the largest. A step is 16 of `.spz`, which compress better.
@@ -104,7 +104,7 @@ def to_gaussians(words: Bits, to_world: Similarity, sh_degree: int) -> Gaussians
     least_log_scale = max(_SMALL, _MIN_LOG_SCALE - math.log(to_world.scale))
     fields = _split(words)
     colours = (fields[0] + 0.5) * _COLOUR_STEP - _COLOUR_STEP * 2 ** (COLOUR_BITS - 1)
-    scales = fields[1] * _SCALE_STEP + least_log_scale
+    scales = fields[1] * SCALE_STEP + least_log_scale
     positions = (fields[2] + 0.5) / 2**POSITION_BITS
     parts = (fields[3] + 0.5) / 2**ROTATION_BITS * 2 * _ROTATION_REACH - _ROTATION_REACH
     w = np.sqrt(1 - np.square(parts).sum(axis=1, keepdims=True))
@@ -122,13 +122,8 @@ def colours_of(model: Gaussians) -> Integers:
     return _nearest(colours / _COLOUR_STEP + 2 ** (COLOUR_BITS - 1) - 0.5, COLOUR_BITS)
 
 
-def scale_steps(model: Gaussians) -> Doubles:
-    """Log scales [N, 3] in lattice steps; the offset of the lattice is unknown, see `likely_shifts`."""
-    return doubles(model.log_scales) / _SCALE_STEP
-
-
 def scales_at(steps: Doubles, shift: float) -> Integers:
-    """Nearest lattice points [N, 3] of log scales, for a lattice with offset `shift`."""
+    """Nearest lattice points [N, 3] of log scales / SCALE_STEP, for a lattice with offset `shift`."""
     return _nearest(steps - shift, SCALE_BITS)
 
 
@@ -193,11 +188,6 @@ def read_packets(key: bytes, words: Bits, width: int) -> tuple[Words, Bytes]:
     data = np.packbits(words[:, : 8 * width], axis=1)
     tags = words[:, 8 * width :]
     return _number(tags) ^ _masks(key, data, tags.shape[1]), data
-
-
-def write_header(key: bytes, value: int, noise: Bytes) -> Bits:
-    """Words [HEADERS, WORD_BITS] that hold `value`, of _HEADER_BITS bits, and `noise` [HEADERS, width]."""
-    return write_packets(key, np.full(HEADERS, value, np.uint64), noise)
 
 
 def read_header(key: bytes, words: Bits, width: int) -> int | None:

@@ -53,22 +53,6 @@ _FOREIGN, _DEVIATIONS = 0.25, 4.0  # least share of foreign carriers to warn of;
 _NOTHING = Header(bytes(5), ONE, 0, 63, 64, 0, 0)  # read for wrong keys, so that all keys take equally long
 
 
-class Colours(Channel):
-    """The channel; see `keyss.channels.base.Channel`."""
-
-    place = "colours"
-    survives = True
-
-    def prepare(self, cover: Gaussians) -> ColoursCover:
-        return ColoursCover(Planner(cover, Carriers.of(cover)))
-
-    def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
-        return _capacity(gaussians * _BITS_PER_GAUSSIAN // 8 - _HEADERS, _FURTHER)
-
-
-COLOURS = Colours()
-
-
 @dataclass(frozen=True)
 class ColoursCover:
     """A cover with known capacity; see `keyss.channels.base.PreparedCover`.
@@ -77,6 +61,10 @@ class ColoursCover:
     """
 
     planner: Planner
+
+    @staticmethod
+    def of(cover: Gaussians) -> ColoursCover:
+        return ColoursCover(Planner(cover, Carriers.of(cover)))
 
     @property
     def cover(self) -> Gaussians:
@@ -180,6 +168,13 @@ class ColoursCover:
         sh = self.cover.sh.detach().clone()
         sh[torch.from_numpy(carriers.rows).to(sh.device), 0, 1:] = torch.from_numpy(new[:, 1:]).to(sh)
         return replace(self.cover.detach(), sh=sh)
+
+
+def _estimated_capacity(gaussians: int, sh_degree: int) -> Capacity:
+    return _capacity(gaussians * _BITS_PER_GAUSSIAN // 8 - _HEADERS, _FURTHER)
+
+
+COLOURS = Channel("colours", ColoursCover.of, _estimated_capacity, survives=True)
 
 
 @dataclass(frozen=True)

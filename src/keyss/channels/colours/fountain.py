@@ -42,8 +42,6 @@ class Fountain:
 
     def encode(self, data: Bits, seeds: Words) -> Bits:
         """Code bits [n] of `seeds` [n] for the bits `data` [size]."""
-        if data.shape != (self.size,):
-            raise ValueError(f"expected {self.size} bits, got {data.shape}")
         every = np.concatenate([data, np.bitwise_xor.reduce(data[self._checks()], axis=1)])
         members, starts, _ = self._equations(seeds)
         return np.bitwise_xor.reduceat(every[members], starts)

@@ -22,7 +22,7 @@ from keyss.files.formats.sog import SogCodes
 from keyss.files.formats.spz import MAX_FRACTIONAL_BITS, MAX_POSITION, SpzCodes
 
 _WRITTEN = ("means", "quats", "log_scales")  # attributes that carry bits in any format
-_OPACITIES = 256
+_OPACITIES = 256  # different ones in any format, at most
 _SAMPLE = 1024  # Gaussians of a first check
 _CLOSE = 1e-5  # maximum relative difference between decoders
 _MIN_EXACT = 0.9  # share of exact Gaussians
@@ -40,8 +40,11 @@ class Decoded:
     @staticmethod
     def of(model: Gaussians) -> Decoded | None:
         """None if the model was decoded from none of the formats."""
-        if isinstance(model, CodedGaussians) or not len(model) or not _opacities_are_bytes(model):
+        if isinstance(model, CodedGaussians) or not len(model):
             return None
+        for some in (model.opacity_logits[:_SAMPLE], model.opacity_logits):
+            if len(some.detach().unique()) > _OPACITIES:
+                return None
         model = model.detach().to("cpu")
         for quantise in (_spz, _sog, _compressed_ply):
             codes = quantise(model)
@@ -71,12 +74,6 @@ class Decoded:
                 now = now * _signs(values, was)
             changes[name] = torch.where((was == getattr(new, name)).all(1, keepdim=True), values, now)
         return replace(self.model, **changes)
-
-
-def _opacities_are_bytes(model: Gaussians) -> bool:
-    """True if there are at most 256 different opacities, as in all of the formats."""
-    parts = model.opacity_logits[:_SAMPLE], model.opacity_logits
-    return all(len(part.detach().unique()) <= _OPACITIES for part in parts)
 
 
 def _spz(model: Gaussians) -> Codes | None:

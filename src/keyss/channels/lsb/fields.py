@@ -59,13 +59,8 @@ class Field:
     levels: Levels  # [N]
     bits: Levels  # [N] bits that each level carries, 0 to MAX_BITS
 
-    @property
-    def total_bits(self) -> int:
-        """Bits of all levels together."""
-        return int(self.bits.sum())
-
     def read(self) -> Bytes:
-        """[total_bits] the last bits of all levels, the lowest first."""
+        """[B] the last bits of all levels, the lowest first."""
         bits = self.levels[:, None] >> np.arange(MAX_BITS, dtype=np.int32) & 1
         return bits[self._places()].astype(np.uint8)
 
@@ -75,7 +70,7 @@ class Field:
         return (1 << self.bits) // 2
 
     def with_bits(self, bits: Bytes, ties: Doubles) -> Levels:
-        """[N] the nearest levels from which `read` gives `bits` [total_bits].
+        """[N] the nearest levels from which `read` gives `bits` [B].
 
         `ties` [N] in [-0.5, 0.5]: break ties between equally near levels.
         """

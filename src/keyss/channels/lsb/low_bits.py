@@ -49,13 +49,18 @@ from keyss.keys.derivation import MASTER_BYTES, DerivedKey, expand, fill, stream
 Part = tuple[int, Integers, Bytes]  # a depth, rows of the model, and what is written into each
 
 
-class LowBits(Channel):
-    """The channel in the low bits of floats; see `keyss.channels.base.Channel`."""
+@dataclass(frozen=True)
+class LowBitsCover:
+    """A cover and its usable Gaussians; see `keyss.channels.base.PreparedCover`."""
 
-    place = "low bits"
+    cover: Gaussians
+    layout: Layout
+    carriers: Carriers
+    salt_rows: Integers  # [S] rows of the salts' Gaussians, in order
 
-    def prepare(self, cover: Gaussians) -> LowBitsCover:
-        """See `Channel`. Raises UsageError for low bits that are few or not random, and for stale salts."""
+    @staticmethod
+    def of(cover: Gaussians) -> LowBitsCover:
+        """Raises UsageError for low bits that are few or not random, and for stale salts."""
         layout = Layout.of(cover)
         carriers = Carriers.of(cover, layout)
         rows = salt_rows(cover, carriers.ids, layout)
@@ -68,22 +73,6 @@ class LowBits(Channel):
             )
         return LowBitsCover(cover, layout, carriers, rows)
 
-    def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
-        return LowBitsCapacity.of(gaussians, Layout(sh_degree)).for_payloads()
-
-
-LOW_BITS = LowBits()
-
-
-@dataclass(frozen=True)
-class LowBitsCover:
-    """A cover and its usable Gaussians; see `keyss.channels.base.PreparedCover`."""
-
-    cover: Gaussians
-    layout: Layout
-    carriers: Carriers
-    salt_rows: Integers  # [S] rows of the salts' Gaussians, in order
-
     @cached_property
     def capacity(self) -> Capacity:
         return self._capacity.for_payloads()
@@ -91,27 +80,14 @@ class LowBitsCover:
     def embed(self, payloads: Sequence[tuple[str, Payload]], *, entropy: bytes | None = None) -> Gaussians:
         """See `PreparedCover`. Takes 1.6 s for each secret for key derivation."""
         contents = [payload for _, payload in payloads]
-        mixed = container.randomness(entropy, contents, self.carriers.ids.tobytes())
-        salts = self._salts(mixed)[1]
-        fresh = [salts[index] for index in self.fresh_salts]
-        return self.embed_derived([(_derive(key, fresh), payload) for key, payload in payloads], mixed)
-
-    def embed_derived(
-        self, payloads: Sequence[tuple[Sequence[DerivedKey], Payload]], entropy: bytes
-    ) -> Gaussians:
-        """`embed` after key derivation: each secret comes with its key under each of the `fresh_salts`.
-
-        `entropy`: the result of `randomness`, used for this file only.
-        """
-        container.check_keys([keys[0].master for keys, _ in payloads])
-        parts = [(LEAST, self.salt_rows[self.fresh_salts], self._salts(entropy)[0])]
-        parts += Writer(self._capacity, self._usable, self.carriers.ids, entropy).write(payloads)
+        secret = container.randomness(entropy, contents, self.carriers.ids.tobytes())
+        rows, width = self.salt_rows[self.carriers.renewable[self.salt_rows]], self.layout.width(LEAST)
+        renewed = np.frombuffer(stream(secret, "lsb/salts", len(rows) * width), np.uint8).reshape(-1, width)
+        salts = [salt(*carrier) for carrier in zip(self.carriers.ids[rows], renewed, strict=True)]
+        keys = [_derive(key, salts) for key, _ in payloads]
+        container.check_keys([derived[0].master for derived in keys])
+        parts = [(LEAST, rows, renewed), *self._parts(keys, contents, secret)]
         return write_low_bits(self.cover, self.layout, parts)
-
-    @cached_property
-    def fresh_salts(self) -> Integers:
-        """[F] indices of the salts that are not stale."""
-        return np.flatnonzero(self.carriers.renewable[self.salt_rows])
 
     @cached_property
     def _usable(self) -> Flags:
@@ -124,56 +100,32 @@ class LowBitsCover:
     def _capacity(self) -> LowBitsCapacity:
         return LowBitsCapacity(len(self.cover), int(self._usable.sum()), self.layout, self.carriers.depth)
 
-    def _salts(self, entropy: bytes) -> tuple[Bytes, list[bytes]]:
-        """New low bits [F, B] of the Gaussians of fresh salts, and all salts with these low bits."""
-        width = self.layout.width(LEAST)
-        noise = stream(entropy, "lsb/salts", len(self.fresh_salts) * width)
-        fresh = np.frombuffer(noise, np.uint8).reshape(len(self.fresh_salts), width)
-        rows = self.cover[torch.from_numpy(self.salt_rows)]
-        renewed = write_low_bits(rows, self.layout, [(LEAST, self.fresh_salts, fresh)])
-        low = read_low_bits(renewed, LEAST, self.layout)
-        ids = self.carriers.ids[self.salt_rows]
-        return fresh, [salt(*carrier) for carrier in zip(ids, low, strict=True)]
-
-
-@dataclass(frozen=True)
-class Writer:
-    """Writes payloads into the `usable` [N] Gaussians of a model with `ids` [N, 16].
-
-    `entropy`: 32 secret bytes.
-    """
-
-    capacity: LowBitsCapacity
-    usable: Flags
-    ids: Bytes
-    entropy: bytes
-
-    def write(self, payloads: Sequence[tuple[Sequence[DerivedKey], Payload]]) -> list[Part]:
+    def _parts(
+        self, keys: Sequence[Sequence[DerivedKey]], payloads: Sequence[Payload], secret: bytes
+    ) -> list[Part]:
         """What is to be written, in this order: noise, shards and headers.
 
-        Each payload comes with its key under every salt that is not stale. Raises UsageError for too large
-        payloads. Warns (KeyssWarning) if the holder of one key can tell that there are other secrets.
+        `keys`: of each payload, one under every fresh salt. `secret`: 32 bytes, all randomness of this file.
         """
-        sizes = [container.sealed_size(payload, EXACT_BYTES) for _, payload in payloads]
-        plan = self.capacity.plan(sizes)
+        plan = self._capacity.plan([container.sealed_size(payload, EXACT_BYTES) for payload in payloads])
         if not plan.independent and len(payloads) > 1:
             container.warn_of_others()
-        rows = np.flatnonzero(self.usable)
-        noise = np.empty((len(rows), self.capacity.layout.width(plan.depth)), np.uint8)
-        fill(self.entropy, "lsb/noise", noise)
+        rows = np.flatnonzero(self._usable)
+        noise = np.empty((len(rows), self.layout.width(plan.depth)), np.uint8)
+        fill(secret, "lsb/noise", noise)
         for attempt in count():  # until no group of shards is too small
-            free = self.usable.copy()
-            headers, data_keys = self._headers(attempt, plan, [keys for keys, _ in payloads], free)
+            free = self._usable.copy()
+            headers, data_keys = self._headers(attempt, plan, keys, free, secret)
             left = np.flatnonzero(free)
-            left = left[random_order(self.entropy, f"lsb/shards/{attempt}", len(left))]
+            left = left[random_order(secret, f"lsb/shards/{attempt}", len(left))]
             bodies = list[Part]()
-            for data_key, (_, payload), share in zip(data_keys, payloads, plan.shares, strict=False):
+            for data_key, payload, share in zip(data_keys, payloads, plan.shares, strict=False):
                 chosen, left = left[: share.carriers], left[share.carriers :]
                 shards = Shards(data_key, share.codewords, is_tagged(noise.shape[1]))
-                ids = self.ids.take(chosen, axis=0)
+                ids = self.carriers.ids.take(chosen, axis=0)
                 if (numbers := shards.numbers(ids)) is None:
                     break
-                record = exact_record(data_key, self.ids)
+                record = exact_record(data_key, self.carriers.ids)
                 sealed = container.seal(data_key, payload, share.codewords.size, record)
                 contents = share.codewords.encode(sealed).take(numbers, axis=0)
                 bodies.append((plan.depth, chosen, shards.encrypt(ids, numbers, contents)))
@@ -182,18 +134,26 @@ class Writer:
         raise AssertionError
 
     def _headers(
-        self, attempt: int, plan: Allocation, keys: Sequence[Sequence[DerivedKey]], free: Flags
+        self,
+        attempt: int,
+        plan: Allocation,
+        keys: Sequence[Sequence[DerivedKey]],
+        free: Flags,
+        secret: bytes,
     ) -> tuple[list[Part], list[bytes]]:
-        """The headers of all secrets, and their data keys; their places are not `free` [N] any more.
+        """The headers of all payloads, and their data keys; their places are not `free` [N] any more.
 
         Missing headers take places, too: otherwise collisions would tell how many there are.
         """
         total = max(MAX_INDEPENDENT if plan.independent else 0, len(keys))
-        data_keys = [self._secret(f"data-key/{attempt}/{index}", DATA_KEY_BYTES) for index in range(total)]
-        width, parts = self.capacity.layout.width(LEAST), list[Part]()
-        for index in random_order(self.entropy, f"lsb/headers/{attempt}", total).tolist():
+        data_keys = [
+            expand(secret, f"lsb/data-key/{attempt}/{index}", DATA_KEY_BYTES) for index in range(total)
+        ]
+        width, parts = self.layout.width(LEAST), list[Part]()
+        for index in random_order(secret, f"lsb/headers/{attempt}", total).tolist():
             salted: Sequence[DerivedKey] = [
-                DerivedKey(self._secret(f"no-key/{index}/{n}")) for n in range(len(keys[0]))
+                DerivedKey(expand(secret, f"lsb/no-key/{index}/{n}", MASTER_BYTES))
+                for n in range(len(keys[0]))
             ]
             packed = b""
             if index < len(keys):
@@ -202,14 +162,18 @@ class Writer:
             messages = [(parameter_message(data_keys[index], width), packed)]
             messages += [(key_message(container.key_secret(key), width), data_keys[index]) for key in salted]
             for message, data in messages:
-                rows, contents = message.write(self.ids, data)
+                rows, contents = message.write(self.carriers.ids, data)
                 if index < len(keys):
                     parts.append((LEAST, rows[free[rows]], contents[free[rows]]))
                 free[rows] = False
         return parts, data_keys
 
-    def _secret(self, label: str, size: int = MASTER_BYTES) -> bytes:
-        return expand(self.entropy, f"lsb/{label}", size)
+
+def _estimated_capacity(gaussians: int, sh_degree: int) -> Capacity:
+    return LowBitsCapacity.of(gaussians, Layout(sh_degree)).for_payloads()
+
+
+LOW_BITS = Channel("low bits", LowBitsCover.of, _estimated_capacity)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,7 @@
 """The division of carriers between secrets in low bits, and the messages of a header.
 
-A secret has a *header* of short messages (see `shards`): its data key, encrypted for each salt, and its
-parameters. Its payload is cut into shards with Reed-Solomon redundancy, one in each carrier of its share: any
-quarter of all Gaussians may be lost. The number of shards does not reveal the size of the payload.
+A secret has a *header* of short messages (see `shards`), its data key for each salt and its parameters, and
+shards in all carriers of its share, whose number does not reveal the size of the payload.
 
 A *share* is a part of the carriers at a depth. A key must not reveal whether there are other secrets, so a
 secret's share depends on its own size only: the first that holds it of a quarter, a half and all of the

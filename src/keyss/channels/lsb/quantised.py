@@ -1,9 +1,8 @@
 """The channel in the quantised values of a `.spz`, `.sog` or compressed `.ply`, or of a decoded model.
 
-The slots are blocks of last bits (see `wet_paper`), which are never lost or reordered. The first gives the
-salt. A secret takes consecutive blocks, cyclically: its parameters, then its sealed payload. A reader
-decrypts parameters in all blocks and keeps those with the right check. Other blocks hold noise, so the number
-of secrets does not show, and all arrangements are equally likely.
+The slots are blocks of last bits (see `wet_paper`), which are never lost or reordered. A secret takes
+consecutive blocks, cyclically. Other blocks hold noise, so the number of secrets does not show, and all
+arrangements are equally likely.
 """
 
 from __future__ import annotations
@@ -48,29 +47,25 @@ _ATTEMPTS = 30  # attempts to solve all blocks; one fails for at most one cover 
 _BITS_PER_GAUSSIAN = 18  # approximate capacity
 
 
-class QuantisedChannel(Channel):
+def quantised_channel(format: str, decoded: Decoded | None = None) -> Channel:
     """The channel in the quantised values of `format`, `spz`, `sog` or `compressed-ply`.
 
-    Their file is published, or the model that was `decoded` from them.
+    Their file is published, and a model that was read from such a file keeps its values. With `decoded`, its
+    model is published, and the cover is this model, perhaps with fewer harmonics.
     """
 
-    def __init__(self, format: str, decoded: Decoded | None = None) -> None:
-        self.format, self.decoded = format, decoded
-        self.place = f"quantised values of {format}"
-        if decoded:
-            self.place = f"values of the {format} file that the cover was decoded from"
+    def prepare(cover: Gaussians) -> QuantisedCover:
+        if decoded is None:
+            return QuantisedCover.of(QUANTISED[format].of(cover))
+        return QuantisedCover.of(decoded.codes, replace(decoded, model=cover.detach().to("cpu")))
 
-    def prepare(self, cover: Gaussians) -> QuantisedCover:
-        """See `Channel`. A model that was read from a file of this format keeps its values.
-
-        With `decoded`, the cover is its model, perhaps with fewer harmonics.
-        """
-        if self.decoded is None:
-            return QuantisedCover.of(QUANTISED[self.format].of(cover))
-        return QuantisedCover.of(self.decoded.codes, replace(self.decoded, model=cover.detach().to("cpu")))
-
-    def estimate_capacity(self, gaussians: int, sh_degree: int) -> Capacity:
+    def estimate(gaussians: int, sh_degree: int) -> Capacity:
         return _capacity(gaussians * _BITS_PER_GAUSSIAN // 8, wet_paper.BLOCK // 8)
+
+    place = f"quantised values of {format}"
+    if decoded:
+        place = f"values of the {format} file that the cover was decoded from"
+    return Channel(place, prepare, estimate)
 
 
 @dataclass(frozen=True)
@@ -92,15 +87,9 @@ class QuantisedCover:
         free = writable_levels(ordered, places, fixed_axes(codes), _digest(codes))
         cover = QuantisedCover(ordered, places, free, own_hash, model)
         if len(cover.ids) < MIN_BLOCKS or cover.width < LEAST_BYTES:
-            why = "it has too few Gaussians"
-            if len(cover.ids) >= MIN_BLOCKS:
-                why = (
-                    f"{cover.dry.mean():.0%} of the last bits can change unnoticed, and each block of "
-                    f"{wet_paper.BLOCK:,} needs {8 * LEAST_BYTES} such bits"
-                )
             raise UsageError(
                 f"a cover of {len(codes):,} Gaussians has no room for secrets in the quantised values of "
-                f"{codes.name} files: {why}"
+                f"{codes.name} files: {int(cover.dry.sum()):,} last bits can change unnoticed"
             )
         return cover
 
@@ -189,7 +178,7 @@ class QuantisedCover:
     def _with_bits(self, bits: Bits, entropy: bytes) -> Codes:
         """The quantised values with new last `bits` of all levels."""
         columns: dict[str, list[Levels]] = {}
-        parts = np.split(bits, np.cumsum([field.total_bits for field in self.fields])[:-1])
+        parts = np.split(bits, np.cumsum([field.bits.sum() for field in self.fields])[:-1])
         for field, free, field_bits in zip(self.fields, self.free, parts, strict=True):
             ties = random_fractions(entropy, f"codes/ties/{field.name}/{field.column}", len(free)) - 0.5
             levels = np.where(free, field.with_bits(field_bits, ties), field.levels)

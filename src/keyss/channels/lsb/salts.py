@@ -1,9 +1,7 @@
-"""Salts of Argon2id, in the low bits of Gaussians.
+"""Salts of Argon2id: hashes of a Gaussian and its low bits, which carry nothing else.
 
-A *salt* is a hash of one Gaussian and its low bits, which are new random bits for every file and carry
-nothing else: no two files of one cover share a salt. There are several because Gaussians may be removed.
-Embedding keeps their order: by ID, but last are Gaussians that are often not usable, since they moved away
-from zero by equal steps or have small even numbers.
+They are new for every file: no two files of one cover share a salt. There are several because Gaussians may
+be removed. Embedding keeps their order: by ID, but last are Gaussians that are often not usable.
 """
 
 from __future__ import annotations

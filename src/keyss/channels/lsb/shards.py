@@ -1,19 +1,15 @@
-"""Shards and messages in slots with IDs, the low bits of Gaussians.
+"""Shards and messages in slots with IDs, the low bits of Gaussians (docs/byte-layout.md).
 
 Everything follows from a pseudo-random function of a secret and each Gaussian's ID, AES-256: Gaussians may
 have any order, and nothing marks a carrier. No pad is used twice, because every secret here is new for every
 file.
 
-*Messages* of a few bytes, the data key and the parameters, are cut into fragments that fit into the low bits
-of one Gaussian at the least depth. Each fragment has several places, the Gaussians with the smallest function
-values among those that the function assigns to it. Some of these cannot be written, are taken or lost. A
-reader looks at eight times as many, because others may have been added: the most frequent content counts.
+Each fragment of a *message* has several places. Some of these cannot be written, are taken or lost. A reader
+looks at eight times as many, because others may have been added: the most frequent content counts.
 
-*Shards* of a payload fill all Gaussians of a secret's share. The function assigns each Gaussian to a group
-of codewords, and masks the number that a shard has in its group. Rows of 5 bytes and more begin with a tag of
-one byte, which one in 256 of the other Gaussians has by chance. Smaller rows have none; there, one in 64 has
-a valid number by chance. Such false shards either contradict a true one, so that both are lost, or are
-errors, which the code corrects.
+*Shards* of a payload fill all Gaussians of a secret's share. One in 256 of the other Gaussians has the tag of
+a shard by chance; rows of less than 5 bytes have none, and there one in 64 has a valid number. Such false
+shards either contradict a true one, so that both are lost, or are errors, which the code corrects.
 """
 
 from __future__ import annotations

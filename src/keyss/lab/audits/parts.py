@@ -17,11 +17,10 @@ import torch
 
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
-from keyss.files.images import png_bytes
 from keyss.fitting.image_metrics import mean_quality, view_quality
 from keyss.lab.auc import Auc
 from keyss.lab.audits.record import Section, Table, Verdict, Word, auc_text, text_of
-from keyss.lab.audits.subject import Subject, Work
+from keyss.lab.audits.subject import Subject
 from keyss.lab.distances import AttributeDistance, Sinkhorn3D, against_controls, composite_score, sinkhorn_3d
 from keyss.lab.leaks.attacks import decoder_attack, file_attacks
 from keyss.lab.leaks.leak_scores import GRADIENT_LIMIT, PSNR_LIMIT, SSIM_LIMIT, AttackResult, look_for_secret
@@ -253,8 +252,7 @@ def leaks(subject: Subject, seed: int, share: Share) -> tuple[Section, Pictures]
         name = role_of(index, len(subject.scenes))
         results[name], shown = look_for_secret(subject.stego, subject.controls, secret, attacks)
         tables.append(Table((f"attack on the {name}", *heads), tuple(map(_leak_row, results[name]))))
-        for row in results[name]:
-            pictures[f"{name}, {row.attack}"] = png_bytes(shown[row.attack])
+        pictures[name] = contact_sheet(("published model", "plain model", "the secret"), shown)
     verdicts = leak_verdicts(results)
     return Section(verdicts=verdicts, tables=tables, numbers=_builtins(results)), pictures
 
@@ -352,7 +350,7 @@ class Part:
     title: str
     note: str  # what its numbers mean
     measure: Callable[[Subject, int, Share], tuple[Section, Pictures]]
-    work: Work
+    views: int  # takes about as long as measuring so many test views: see `Subject.view_seconds`
     only_3dgs: bool = True  # needs a published 3DGS model
 
 
@@ -363,7 +361,7 @@ PARTS = {
         "3DGS of the same scene, with as many training steps if the run was made with --bound. A wrong key "
         "should show no more of the secret than the published model itself does (chance level).",
         images,
-        Work(views=48),
+        48,
         only_3dgs=False,
     ),
     "parameters": Part(
@@ -373,7 +371,7 @@ PARTS = {
         "3D-Sinkhorn is for comparison with the paper and gets no verdict: it does not change if scales "
         "are doubled or colours swapped.",
         parameters,
-        Work(seconds=3.0, per_gaussian=2e-3),
+        300,
     ),
     "stealth": Part(
         "The file by itself",
@@ -382,29 +380,28 @@ PARTS = {
         "such as a given cover of another trainer, is unusual too, p says nothing about the secret. An "
         "observer with plain models of other scenes can train detectors: `benchmarks/stealth.py`.",
         stealth,
-        Work(per_gaussian=1e-3),
+        150,
     ),
     "stegexpose": Part(
         "StegExpose on renders",
         "It looks for replaced low bits of 8-bit pixels, but a renderer computes each pixel: 0.5 is "
         "expected whatever the model hides.",
         stegexpose,
-        Work(seconds=2.0, views=24),
+        60,
         only_3dgs=False,
     ),
     "leaks": Part(
         "Leaks without the key",
         "Attacks on the published file, scored against the secret's test views after a fit of colours. In "
-        "brackets: the difference from the same attack on plain models; 0 shows nothing of the secret. "
-        "Pictures: published model, plain model, the secret.",
+        "brackets: the difference from the same attack on plain models; 0 shows nothing of the secret.",
         leaks,
-        Work(seconds=3.0, views=160),
+        200,
     ),
     "robustness": Part(
         "Robustness",
         "PSNR on test views after a change of the published model; in brackets, the change.",
         robustness,
-        Work(seconds=20.0, views=1000),
+        1200,
     ),
-    "speed": Part("Speed", "Both models are rendered in turn.", speed, Work(views=32), only_3dgs=False),
+    "speed": Part("Speed", "Both models are rendered in turn.", speed, 32, only_3dgs=False),
 }

@@ -25,19 +25,6 @@ from keyss.runs.open_run import HidingRun
 from keyss.runs.planning import view_seconds
 
 
-@dataclass(frozen=True)
-class Work:
-    """The cost of a measure."""
-
-    seconds: float = 0.0  # constant, mostly attempts to open
-    views: int = 0  # to render
-    per_gaussian: float = 0.0  # seconds per Gaussian of the stego model
-
-    def time(self, view_seconds: float, gaussians: int) -> float:
-        """About the seconds that it takes; `view_seconds`: see `Subject`."""
-        return 0.1 + self.seconds + self.views * view_seconds + self.per_gaussian * gaussians
-
-
 @dataclass
 class Subject:
     """A run, and data that its measures share; models on `device`."""

@@ -17,7 +17,7 @@ from keyss.core.gaussians import Gaussians
 from keyss.lab.audits import PARTS
 from keyss.lab.audits.audit_run import EXTRA
 from keyss.lab.audits.parts import published_distance, render_times, stegexpose_aucs
-from keyss.lab.audits.subject import Subject, Work
+from keyss.lab.audits.subject import Subject
 from keyss.lab.robustness.changes import Change, opacity_pruning, purification, random_pruning
 from keyss.lab.robustness.converters import converters
 from keyss.lab.robustness.survival import ChangedQuality, measure_robustness
@@ -135,18 +135,18 @@ class Measure:
     """An entry of the table of measures."""
 
     numbers: Callable[[Subject], Numbers]
-    work: Work
+    views: int  # as in `Part`
     modules: tuple[str, ...] = ()  # of the extra `audit`
 
 
 MEASURES = {
-    "files": Measure(files, Work()),
-    "pictures": Measure(pictures, Work(views=8)),
-    "secrecy": Measure(secrecy, Work(seconds=0.5, views=43, per_gaussian=9e-4), ("sklearn",)),
-    "survival": Measure(survival, Work(seconds=8.0, views=48)),
-    "rendering": Measure(rendering, Work(views=16)),
-    "pruning": Measure(pruning, Work(seconds=8.0, views=200)),
-    "sinkhorn": Measure(sinkhorn, Work(seconds=1.0, per_gaussian=1e-4), ("ot",)),
+    "files": Measure(files, 1),
+    "pictures": Measure(pictures, 8),
+    "secrecy": Measure(secrecy, 200, ("sklearn",)),
+    "survival": Measure(survival, 150),
+    "rendering": Measure(rendering, 16),
+    "pruning": Measure(pruning, 300),
+    "sinkhorn": Measure(sinkhorn, 40, ("ot",)),
 }
 
 

@@ -68,8 +68,5 @@ def _open(companion: CompanionTensors) -> Show:
 
 
 METHOD = Baseline(
-    options=DecoderOptions,
-    capabilities=Capabilities(keys=False),
-    open=_open,
-    training=DecoderTraining,
+    options=DecoderOptions, capabilities=Capabilities(keys=False), open=_open, training=DecoderTraining
 )

@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from keyss.core.arrays import Bytes
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene, View
@@ -25,7 +26,6 @@ GRADIENT_LIMIT = 0.1  # correlation of coarse gradients with the photos', above 
 
 COARSE = 64  # pixels of the longer side: slightly misplaced shapes still match
 
-_GAP = 4  # pixels between the parts of a picture
 _VIEWS = 8  # cameras per scene for attacks
 
 
@@ -48,9 +48,7 @@ class LeakScores:
     def evidence(self) -> float:
         """The maximum ratio of a leak's scores to their limits; above 1 the secret's shapes are visible."""
         return max(
-            self.psnr_fitted / PSNR_LIMIT,
-            self.ssim_fitted / SSIM_LIMIT,
-            self.gradient / GRADIENT_LIMIT,
+            self.psnr_fitted / PSNR_LIMIT, self.ssim_fitted / SSIM_LIMIT, self.gradient / GRADIENT_LIMIT
         )
 
     def __sub__(self, other: LeakScores) -> LeakScores:
@@ -126,18 +124,14 @@ class AttackResult:
 
 @torch.no_grad()
 def look_for_secret(
-    stego: Gaussians,
-    controls: Sequence[Gaussians],
-    secret: Scene,
-    attacks: Sequence[Attack],
-) -> tuple[list[AttackResult], dict[str, Tensor]]:
+    stego: Gaussians, controls: Sequence[Gaussians], secret: Scene, attacks: Sequence[Attack]
+) -> tuple[list[AttackResult], dict[str, list[Bytes]]]:
     """Score attacks by their renders from the secret's test cameras against its photos.
 
     This is the strictest assumption: the attacker knows the cameras. `controls` are plain models of the
     cover; `secret` has its test cameras in the cover's frame (`keyss.measure.in_cover`); at most 8 are used.
-    Also returns images, uint8 [H, W, 3], by attack: its best variant on the stego model and on the
-    first control from the first test camera, and the photo. Raises UsageError without a control or test
-    views.
+    Also returns three images, [H, W, 3] uint8, by attack: its best variant on the stego model and on a
+    control from the first test camera, and the photo. Raises UsageError without a control or test views.
     """
     if not controls:
         raise UsageError("leaks: expected at least one plain model of the cover to compare with")
@@ -145,12 +139,12 @@ def look_for_secret(
         raise UsageError(f"leaks: the scene {secret.name} has no test views")
     views = subsample_views(secret.test, _VIEWS)
 
-    def look(attack: Attack, model: Gaussians) -> dict[str, tuple[LeakScores, Tensor]]:
+    def look(attack: Attack, model: Gaussians) -> dict[str, tuple[LeakScores, Bytes]]:
         """Scores of all variants of an attack, and pictures [H, W, 3] uint8 from the first view."""
         shown = {}
         for label, variant in attack.show(model):
             image = render(variant, views[0].camera, secret.background).clamp(0, 1)
-            picture = (image * 255).round().to(torch.uint8).cpu()
+            picture = (image * 255).round().to(torch.uint8).cpu().numpy()
             shown[label] = leak_scores(variant, views, secret.background), picture
         return shown
 
@@ -164,7 +158,5 @@ def look_for_secret(
         best = max(leaks, key=lambda label: leaks[label].evidence())
         scores, picture = variants[best]
         results.append(AttackResult(attack.name, attack.sentence, best, scores, leaks[best]))
-        images = [picture, of_controls[0][best][1], views[0].image.cpu()]
-        padded = [F.pad(image, (0, 0, 0, _GAP), value=255) for image in images]  # white gaps
-        pictures[attack.name] = torch.cat(padded, dim=1)[:, :-_GAP]
+        pictures[attack.name] = [picture, of_controls[0][best][1], views[0].image.cpu().numpy()]
     return results, pictures

@@ -26,7 +26,6 @@ from keyss.measure.renders import contact_sheet, renders_of
 from keyss.methods import MethodOptions, registry
 from keyss.progress import Reporter
 from keyss.rendering import Backend, resolve_device
-from keyss.rendering.orbit import is_model
 from keyss.runs import write_record
 from keyss.runs.files import PathLike
 from keyss.runs.open_run import HidingRun
@@ -136,8 +135,6 @@ def compare(
     row with the error. Raises UsageError before training if one of `methods` is not possible with these
     settings, other KeyssErrors, and KeyboardInterrupt.
     """
-    if is_model(cover) or is_model(secret):
-        raise UsageError("comparing takes scenes, folders of photos: models have none to compare with")
     kind = resolve_device(device).type
     chosen = {name: _parse_method(name, kind) for name in methods or EVERY}
     sizes = {"iterations": iterations, "max_gaussians": max_gaussians}

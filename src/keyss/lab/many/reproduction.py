@@ -25,7 +25,6 @@ from keyss.lab.many.trial_folder import Forecast, TrialFolder
 from keyss.methods import registry
 from keyss.progress import Reporter
 from keyss.rendering import Backend
-from keyss.rendering.orbit import is_model
 from keyss.runs import write_record
 from keyss.runs.files import PathLike
 
@@ -201,8 +200,6 @@ def reproduce(
 
 def _paths(scenes: Sequence[PathLike]) -> dict[str, str]:
     """Folders of scenes, by name. Raises UsageError."""
-    if any(map(is_model, scenes)):
-        raise UsageError("expected scenes, folders of photos: models have none to compare with")
     paths: dict[str, str] = {}
     for path in map(os.path.realpath, scenes):
         name = os.path.basename(path)

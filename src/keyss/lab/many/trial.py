@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from itertools import zip_longest
 from math import isfinite
@@ -35,7 +35,7 @@ from keyss.rendering import Backend, resolve_device
 from keyss.rendering.orbit import is_model
 from keyss.runs import FitMetrics, HideMetrics, Manifest, read_manifest, read_record, record_bytes
 from keyss.runs.estimates import seconds_for
-from keyss.runs.files import METRICS, as_scene, stego_in
+from keyss.runs.files import METRICS, stego_in
 from keyss.runs.folder import PRIVATE, make_private
 from keyss.runs.open_run import HidingRun, open_run
 from keyss.runs.planning import Cost, cost_of_fit
@@ -136,11 +136,8 @@ def run_trial(trial: Trial, folder: Path, reporter: Reporter) -> Result:
     return result
 
 
-def cost_of_trial(trial: Trial, folder: Path, read: Callable[[str, ViewOptions], Scene] = as_scene) -> Cost:
-    """The cost of a trial, without the plain fits of other trials. Raises KeyssError.
-
-    `read`: `as_scene`, or one that remembers scenes that trials share.
-    """
+def cost_of_trial(trial: Trial, folder: Path, read: Callable[[str, ViewOptions], Scene]) -> Cost:
+    """The cost of a trial, without plain fits of other trials; `read` reads scenes. Raises KeyssError."""
     if isinstance(trial.options, FitConfig):
         return cost_of_fit(read(trial.cover, trial.views), trial.options, resolve_device(trial.device))
     keys = [f"key {index}" for index, _ in enumerate(trial.secrets)]
@@ -158,13 +155,8 @@ def cost_of_trial(trial: Trial, folder: Path, read: Callable[[str, ViewOptions],
     cost = hide(**arguments, dry_run=True, reporter=Reporter()).cost
     assert cost is not None  # a dry run always has a cost
     elsewhere = [seconds for seconds, model in zip_longest(cost.fit_seconds, trial.models) if model]
-    measures = _seconds_of(trial.measures, cost.view_seconds, trial.options.fit.max_gaussians)
-    return replace(cost, seconds=cost.seconds - sum(elsewhere) + measures)
-
-
-def _seconds_of(measures: Sequence[str], view: float, gaussians: int) -> float:
-    """About the seconds of measures; `view`: see `Cost.view_seconds`, `gaussians`: of the published model."""
-    return sum((PARTS.get(name) or MEASURES[name]).work.time(view, gaussians) for name in measures)
+    views = sum((PARTS.get(name) or MEASURES[name]).views for name in trial.measures)
+    return replace(cost, seconds=cost.seconds - sum(elsewhere) + views * cost.view_seconds)
 
 
 def keys_of(trial: Trial, folder: Path) -> list[str]:
@@ -231,9 +223,8 @@ def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -
     """Numbers of measures, or notes on them."""
     numbers: dict[str, float | str] = {}
     if parts := [name for name in names if name in PARTS]:
-        keys, done = keys_of(trial, folder), "audit" in read_manifest(folder / RUN).files
-        more: dict[str, Any] = {"device": trial.device, "overwrite": done, "reporter": reporter}
-        audited = audit(folder / RUN, keys, only=parts, **more)
+        keys = keys_of(trial, folder)
+        audited = audit(folder / RUN, keys, only=parts, device=trial.device, reporter=reporter)
         for part in parts:
             numbers |= flat(audited.sections[part].numbers, f"audit.{part}")
     if others := [name for name in names if name not in PARTS]:
@@ -241,10 +232,9 @@ def _measure(trial: Trial, names: list[str], folder: Path, reporter: Reporter) -
         with reporter.waiting(f"opening {trial.name}", seconds_for("reveal", stego_in(folder / RUN))):
             controls = [read_model(_place(folder, path)).to(device) for path in trial.controls]
             subject = Subject(opened_run(trial, folder), device, controls)
-            view = subject.view_seconds
+            view_seconds = subject.view_seconds
         for name in others:
-            with reporter.waiting(f"{trial.name}: {name}", _seconds_of([name], view, len(subject.stego))):
-                numbers |= {
-                    f"{name}.{measure}": value for measure, value in MEASURES[name].numbers(subject).items()
-                }
+            measure = MEASURES[name]
+            with reporter.waiting(f"{trial.name}: {name}", measure.views * view_seconds):
+                numbers |= {f"{name}.{what}": value for what, value in measure.numbers(subject).items()}
     return numbers

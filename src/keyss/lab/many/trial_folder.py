@@ -24,6 +24,7 @@ from keyss.lab.audits.trial_measures import check_extras
 from keyss.lab.many.trial import MASTER_KEY, RUN, Result, Trial, cost_of_trial, finished_result, run_trial
 from keyss.methods import MethodOptions
 from keyss.progress import Reporter, reporter as default_reporter
+from keyss.rendering.orbit import is_model
 from keyss.runs.files import MODEL, as_scene
 from keyss.runs.folder import PRIVATE, check_not_published, make_private
 from keyss.runs.planning import Cost
@@ -64,8 +65,10 @@ class TrialFolder:
     def plain(self, scene: str, config: FitConfig, note: str = "") -> str:
         """Add the plain fit of a scene; returns its model, relative to the folder of another trial.
 
-        `note`: the end of its name, e.g. its seed or what it is for.
+        `note`: the end of its name, e.g. its seed or what it is for. Raises UsageError for a model.
         """
+        if is_model(scene):
+            raise UsageError("expected scenes, folders of photos: models have none to compare with")
         size = f"{config.iterations:,} steps, {config.max_gaussians:,} Gaussians"
         name = f"plain model of {Path(scene).name}, {size}{note and f', {note}'}"
         shared = {field: self.common[field] for field in ("views", "device")}

@@ -8,18 +8,18 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
-from keyss.channels import APPENDED, Channel, Payload, PreparedCover, open_payload
+from keyss.channels import Capacity, Channel, Payload, PreparedCover, appended_count, open_payload
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Scene
+from keyss.fitting.config import FitConfig
 from keyss.fitting.image_metrics import subsample_views
 from keyss.fitting.plain import fit_scene
 from keyss.fitting.schedule import boost_of
 from keyss.kernels.memory import release
-from keyss.methods.carry.capacity import CarryCapacity, SecretSize, check_appended
 from keyss.methods.carry.carry_options import FINE_TUNING, CarryOptions
 from keyss.methods.codec.model_bytes import decode
-from keyss.methods.codec.precision import encode_to_size, finest_size
+from keyss.methods.codec.precision import encode_to_size, finest_size, prune_to_size, usual_size
 from keyss.methods.hidden import Frame, HiddenScene, Recovered
 from keyss.methods.method import (
     Capabilities,
@@ -44,6 +44,9 @@ _PLANNED_SHARE = 0.95  # Gaussians planned / estimate: those that are kept take 
 # Least shares of a secret's Gaussians. Public models fine-tuned with fewer are below 30 dB; with fewer than
 # the second, and than so many Gaussians, below 20 dB or as far from the plain model as empty renders.
 _MIN_SHARE, _HOPELESS_SHARE, _HOPELESS = 1 / 6, 1 / 100, 500
+_BITS_PER_GAUSSIAN = 150, 210  # of a secret that is not fitted yet, with the usual and the finest precision
+_FAR_TOO_LARGE = 1.5  # size of a secret / what can be appended
+_TINY = 16  # Gaussians; secrets are not pruned to fewer
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,77 @@ class CarriedSecret(HiddenScene):
         return hashlib.sha256(self.gaussians.means.numpy().tobytes()).hexdigest()[:16]
 
 
+@dataclass(frozen=True)
+class SecretSize:
+    """The size of a secret, at most if it is not fitted yet."""
+
+    count: int  # Gaussians
+    usual: int  # bytes of its payload with the usual precision
+    finest: int
+    fitted: bool
+
+    @staticmethod
+    def of(model: Gaussians | None, fit: FitConfig) -> SecretSize:
+        """The size of `model`, or of what `fit` will give."""
+        if model is not None:
+            return SecretSize(len(model), usual_size(model), finest_size(model), True)
+        usual, finest = (fit.max_gaussians * bits // 8 for bits in _BITS_PER_GAUSSIAN)
+        return SecretSize(fit.max_gaussians, usual, finest, False)
+
+
+@dataclass(frozen=True)
+class CarryCapacity:
+    """The capacity of a cover: exact for a prepared cover, estimated for one not fitted yet."""
+
+    gaussians: int  # Gaussians of the cover
+    sh_degree: int  # SH degree of the published model
+    channel: Channel
+    payloads: Capacity
+    prepared: PreparedCover | None = None  # None: not fitted yet
+
+    @staticmethod
+    def of(channel: Channel, cover: Gaussians | None, fit: FitConfig) -> CarryCapacity:
+        """The capacity of `cover`, or of what `fit` will give. Raises UsageError if there is none."""
+        if cover is None:
+            size = fit.max_gaussians, fit.sh_degree
+            return CarryCapacity(*size, channel, channel.estimate_capacity(*size))
+        prepared = channel.prepare(cover)
+        return CarryCapacity(len(cover), cover.sh_degree, channel, prepared.capacity, prepared)
+
+    def sizes(self, secrets: Sequence[SecretSize]) -> list[int]:
+        """The number of Gaussians of each secret that fit at their SH degree; an estimate where not all do.
+
+        Raises UsageError if the cover is too small, or a secret far too large for appended Gaussians.
+        """
+        most = self.payloads.bytes
+        for secret in secrets:
+            if self.payloads.grows and secret.fitted and secret.usual > _FAR_TOO_LARGE * most:
+                raise UsageError(
+                    f"the secret takes about {secret.usual:,} bytes, and {most:,} can be appended; fewer "
+                    "Gaussians or a lower SH degree take less"
+                )
+        limits = self.payloads.limits([secret.finest for secret in secrets])
+        counts = [
+            min(secret.count, secret.count * limit // secret.usual)
+            for secret, limit in zip(secrets, limits, strict=True)
+        ]
+        if any(count < min(_TINY, secret.count) for count, secret in zip(counts, secrets, strict=True)):
+            raise UsageError(
+                f"a cover of {self.gaussians:,} Gaussians is too small to hide {len(secrets)} "
+                f"{'secrets' if len(secrets) > 1 else 'secret'} in its {self.channel.place}"
+            )
+        return counts
+
+    def prune(self, models: Sequence[Gaussians], viewpoints: Sequence[Viewpoints]) -> list[Gaussians]:
+        """The most visible Gaussians of each model that fit, or all; see `prune_to_size`.
+
+        Warns (KeyssWarning) if the models have less room than they would alone.
+        """
+        needed = list(map(finest_size, models))
+        limits = self.payloads.limits(needed, warn=True)
+        return [prune_to_size(*model) for model in zip(models, limits, viewpoints, strict=True)]
+
+
 class CarryMethod:
     """See `keyss.methods.method.Method`."""
 
@@ -94,10 +168,6 @@ class CarryMethod:
         """Select the channel, and the secrets that are pruned and fine-tuned; see `Method`."""
         cover, *secrets = sources
         chosen = replace(options, publish="converted") if earlier and earlier.grows else options
-        if chosen.publish == "converted" and chosen.channel == "appended":
-            for secret in secrets:
-                if secret.given is not None:
-                    check_appended(secret.given)
         secret_sizes = [SecretSize.of(secret.given, options.fit) for secret in secrets]
 
         def fit_in(channel: Channel) -> tuple[CarryCapacity, list[int]]:
@@ -106,9 +176,9 @@ class CarryMethod:
             chosen_by_user = options.publish or options.format
             for size, count in zip(secret_sizes, counts, strict=True):
                 hopeless = count < min(_HOPELESS, _HOPELESS_SHARE * size.count)
-                known = cover.given is not None and size.model is not None
+                known = cover.given is not None and size.fitted
                 if hopeless or (known and not chosen_by_user and count < _MIN_SHARE * size.count):
-                    most = "" if size.model else "up to "
+                    most = "" if size.fitted else "up to "
                     raise UsageError(
                         f"a secret of {most}{size.count:,} Gaussians would be cut down to about {count:,}"
                     )
@@ -127,21 +197,16 @@ class CarryMethod:
             )
         ]
         usual = [size.usual for size in secret_sizes]
-        appended = APPENDED.appended_count(usual) if capacity.payloads.grows else 0  # about
-        prunes = any(count < size.count for count, size in zip(counts, secret_sizes, strict=True))
-        kept, flat = (
-            sum(
-                count if count == size.count else int(_PLANNED_SHARE * count)
-                for size, count in zip(secret_sizes, of, strict=True)
-            )
-            for of in (counts, capacity.sizes(secret_sizes, flat=True) if prunes else counts)
-        )
+        appended = appended_count(usual) if capacity.payloads.grows else 0  # about
+        kept = [
+            count if count == size.count else int(_PLANNED_SHARE * count)
+            for size, count in zip(secret_sizes, counts, strict=True)
+        ]
         plan = Plan(
             gaussians=capacity.gaussians + appended,
             sh_degree=capacity.sh_degree,
             secret_gaussians=sum(secret.count for secret in secret_sizes),
-            capacity=kept,
-            flat_capacity=flat,
+            capacity=sum(kept),
             notes=(_note(capacity, appended),),
         )
         return Prepared(
@@ -251,13 +316,13 @@ def embed_models(
     """
     viewpoints, capacity = viewpoints or [*map(Viewpoints.around, models)], cover.capacity
     needed = list(map(finest_size, models))
-    capacity.warn_of_sharing(needed)
+    limits = capacity.limits(needed, warn=True)
     counts, degrees = [*map(len, models)], [model.sh_degree for model in models]
     payloads = [
         Payload(
             CarryOptions.method, encode_to_size(models.pop(0), limit, short=capacity.grows, viewpoints=views)
         )
-        for limit, views in zip(capacity.limits(needed), viewpoints, strict=True)
+        for limit, views in zip(limits, viewpoints, strict=True)
     ]
     release()
     stego = cover.embed(list(zip(keys, payloads, strict=True)), entropy=entropy)

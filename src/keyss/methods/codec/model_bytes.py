@@ -149,7 +149,7 @@ class _Encoder:
         codes[:, 10:13] = _round(quats / _steps(self.steps[4], finer))
         harmonics_steps = _steps(self.steps[5], finer).astype(np.float32)
         with np.errstate(over="ignore", invalid="ignore"):  # clamped below
-            harmonics = _to_opponents(block.sh.numpy()[:, 1:] / harmonics_steps[:, None])
+            harmonics = _transformed(block.sh.numpy()[:, 1:] / harmonics_steps[:, None], OPPONENT)
         codes[:, 13:] = _round(harmonics.reshape(len(block), -1))
         return entropy.encode(codes, *_columns(self.model.sh_degree))
 
@@ -168,7 +168,7 @@ class _Encoder:
             means.clip(-MAX_COORDINATE, MAX_COORDINATE),
             log_scales.clip(-MAX_LOG_SCALE, MAX_LOG_SCALE),
             logits.clip(-_MAX_LOGIT, _MAX_LOGIT),
-            _to_opponents(colours),
+            _transformed(colours, OPPONENT),
         ]
         return _round((np.concatenate(parts, axis=1) - _origin(self.centres)) / _uniform_steps(self.steps))
 
@@ -218,9 +218,9 @@ def decode(data: bytes, model_size: int | None = None) -> Gaussians:
         x, y, z = (codes[:, 10:13] * _steps(steps[4], finer)).T
         w = np.sqrt(np.maximum(1 - (x * x + y * y + z * z), _LEAST_W))
         quats[rows] = np.stack([w, x, y, z], axis=1)
-        sh[rows, :1] = _from_opponents(uniform[3][:, None])
+        sh[rows, :1] = _transformed(uniform[3][:, None], OPPONENT.T)
         harmonics = codes[:, 13:] * _steps(steps[5], finer)
-        sh[rows, 1:] = _from_opponents(harmonics.reshape(len(codes), -1, 3))
+        sh[rows, 1:] = _transformed(harmonics.reshape(len(codes), -1, 3), OPPONENT.T)
 
     in_blocks(fill, count, BLOCK, entropy.read)
     return Gaussians(*map(torch.from_numpy, (means, quats, log_scales, logits, sh)))
@@ -255,18 +255,8 @@ def _uniform_numbers(codes: Numbers, centres: list[float], steps: list[float]) -
     return [numbers[:, :3], numbers[:, 3:6], numbers[:, 6], numbers[:, 7:]]
 
 
-def _to_opponents(colours: Numbers) -> Numbers:
-    """Brightness and two differences [..., 3] of colours [..., 3]."""
-    return _transformed(colours, OPPONENT)
-
-
-def _from_opponents(parts: Numbers) -> Numbers:
-    """Invert `_to_opponents`."""
-    return _transformed(parts, OPPONENT.T)
-
-
 def _transformed(values: Numbers, matrix: Doubles) -> Numbers:
-    """`values` [..., 3] @ matrix.T in a fixed order of operations."""
+    """`values` [..., 3] @ matrix.T in a fixed order of operations; OPPONENT.T inverts OPPONENT."""
     products = np.empty_like(values)
     for at, (a, b, c) in enumerate(matrix.tolist()):
         products[..., at] = a * values[..., 0] + b * values[..., 1] + c * values[..., 2]

@@ -24,7 +24,7 @@ from msgspec import Meta
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from keyss.channels import APPENDED, LOW_BITS, Payload, check_payload_fits, is_appended
+from keyss.channels import APPENDED, LOW_BITS, Payload, appended_count, check_payload_fits, is_appended
 from keyss.core.errors import InputError, KeyssError, KeyssWarning, UsageError
 from keyss.core.gaussians import DRAWN_OPACITY, Gaussians
 from keyss.core.similarity import Similarity
@@ -80,7 +80,7 @@ class KeyssMethod:
         try:
             check_payload_fits(size, options.fit.max_gaussians, secrets, shape.sh_degree)
         except UsageError:
-            appended = APPENDED.appended_count([size] * secrets)
+            appended = appended_count([size] * secrets)
             note = _SMALL.format(plan.gaussians, _APPENDED)
             plan = replace(plan, gaussians=plan.gaussians + appended, notes=(_COST, note))
         return Prepared.of(options, len(sources), plan)

@@ -8,8 +8,8 @@ import { moved, type Similarity } from '../../core/similarity.ts';
 import { type Quaternion, quaternionProduct } from '../../core/vectors.ts';
 import type { Words } from '../../core/words.ts';
 import { encryptBlocks } from '../../keys/aes.ts';
-import { type Derive, expand, here } from '../../keys/keys.ts';
-import { keySecret, type Payload, type Reader, unsealedShards } from '../container.ts';
+import { expand } from '../../keys/keys.ts';
+import { type Reader, saltedReader, unsealedShards } from '../container.ts';
 import { COARSE_BYTES, coarseForeign } from '../foreign.ts';
 import type { Codewords, Shards } from '../reed_solomon.ts';
 import { LEAST, ONE_IN, type PilotData, pilotsOf, POSITION_BITS, readPilots } from './pilots.ts';
@@ -17,50 +17,39 @@ import { LEAST, ONE_IN, type PilotData, pilotsOf, POSITION_BITS, readPilots } fr
 // Gaussians sampled for pilots; maximum number of lattice offsets tried; minimum excess of pilots, in standard deviations.
 const [SAMPLE, TRIED, NOT_BY_CHANCE] = [8000, 8, 3];
 
-/** A model's appended Gaussians, prepared for any number of keys. */
-export class AppendedReader implements Reader {
-  readonly derivations = 1;
-
-  private constructor(
-    readonly salt: Uint8Array,
-    private readonly words: Uint8Array,
-    private readonly model: Gaussians,
-    private readonly toOwn: Similarity, // from the world to the own frame
-  ) {}
-
-  /** Null if there are none, or if their frame cannot be found. */
-  static of(model: Gaussians): AppendedReader | null {
-    const faint = candidates(model);
-    if (faint.count < LEAST / 4) return null;
-    const colours = Uint8Array.from(faint.sh, (each) => nearest(each / COLOUR_STEP + 2 ** (COLOUR_BITS - 1) - 0.5, COLOUR_BITS));
-    const steps = Float64Array.from(faint.logScales, (each) => each / SCALE_STEP); // of their lattice, which lies anywhere
-    for (const shifts of [likelyShifts, shiftsWithPilots]) {
-      let best: { data: PilotData; scales: Uint8Array } | null = null;
-      for (const shift of shifts(steps, colours)) {
-        const scales = scalesAt(steps, shift);
-        const data = readPilots(invariantsOf(colours, scales), faint.means);
-        if (data && (best === null || data.agreeing > best.data.agreeing)) best = { data, scales };
-      }
-      if (best !== null) {
-        const { data: { salt, toOwn }, scales } = best;
-        return new AppendedReader(salt, wordsOfPoints(colours, scales, inOwnFrame(faint, toOwn)), model, toOwn);
-      }
+/** Null if there are no appended Gaussians, or if their frame cannot be found. */
+export function appendedReader(model: Gaussians): Reader | null {
+  const faint = candidates(model);
+  if (faint.count < LEAST / 4) return null;
+  const colours = Uint8Array.from(faint.sh, (each) => nearest(each / COLOUR_STEP + 2 ** (COLOUR_BITS - 1) - 0.5, COLOUR_BITS));
+  const steps = Float64Array.from(faint.logScales, (each) => each / SCALE_STEP); // of their lattice, which lies anywhere
+  for (const shifts of [likelyShifts, shiftsWithPilots]) {
+    let best: { data: PilotData; scales: Uint8Array } | null = null;
+    for (const shift of shifts(steps, colours)) {
+      const scales = scalesAt(steps, shift);
+      const data = readPilots(invariantsOf(colours, scales), faint.means);
+      if (data && (best === null || data.agreeing > best.data.agreeing)) best = { data, scales };
     }
-    return null;
+    if (best !== null) {
+      const { data: { salt, toOwn }, scales } = best;
+      return wordReader(model, wordsOfPoints(colours, scales, inOwnFrame(faint, toOwn)), salt, toOwn);
+    }
   }
+  return null;
+}
 
-  /** The payload that `key` opens, or null. Raises InputError if too much was lost or changed. */
-  async open(key: string, derive: Derive = here): Promise<Payload | null> {
-    const dataKey = keySecret(await derive(key, this.salt));
+/** Reads payloads in `words`; `toOwn`: from the world to the own frame. */
+function wordReader(model: Gaussians, words: Uint8Array, salt: Uint8Array, toOwn: Similarity): Reader {
+  return saltedReader([salt], async (dataKey) => {
     for (const width of WIDTHS) {
-      const codewords = readHeader(expand(dataKey, `header/${width}`), this.words, width);
+      const codewords = readHeader(expand(dataKey, `header/${width}`), words, width);
       if (codewords === null) continue;
-      const packets = readPackets(expand(dataKey, 'packets'), this.words, width);
+      const packets = readPackets(expand(dataKey, 'packets'), words, width);
       const [record, payload] = await unsealedShards(dataKey, codewords, packets, COARSE_BYTES);
-      return { ...payload, foreign: coarseForeign(record, dataKey, this.model, this.toOwn) || undefined };
+      return { ...payload, foreign: coarseForeign(record, dataKey, model, toOwn) || undefined };
     }
     return null;
-  }
+  });
 }
 
 /** The offsets of the log-scale lattice with the most pilots. */

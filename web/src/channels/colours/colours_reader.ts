@@ -5,7 +5,7 @@ import { ascii, joined, quantile } from '../../core/bytes.ts';
 import { InputError, tooMuchLost } from '../../core/errors.ts';
 import type { Gaussians } from '../../core/gaussians.ts';
 import { mix, type Words } from '../../core/words.ts';
-import { type Derive, expand, here, SALT_BYTES } from '../../keys/keys.ts';
+import { expand, here, SALT_BYTES } from '../../keys/keys.ts';
 import { keySecret, type Payload, type Reader, unsealed } from '../container.ts';
 import { type Carriers, carriersOf, chosen, fractions, randomPairs, saltsOf } from './carriers.ts';
 import { Fountain, NOISY } from './fountain.ts';
@@ -15,36 +15,27 @@ const MAX_RATE = 4; // data bits per code bit
 const ALIGNMENTS = 4; // offsets of log scales tried
 const [FOREIGN, DEVIATIONS] = [0.25, 4]; // share of foreign carriers that is told; standard errors
 
-/** The colours of a model, prepared for any number of keys. */
-export class ColoursReader implements Reader {
-  private constructor(private readonly alignments: readonly Carriers[], readonly salts: readonly Uint8Array[]) {}
-
-  static of(model: Gaussians): ColoursReader {
-    const alignments = Array.from({ length: ALIGNMENTS }, (_, each) => carriersOf(model, each / ALIGNMENTS));
-    return new ColoursReader(alignments, saltsOf(alignments[0]));
-  }
-
-  get derivations(): number {
-    return 1 + this.salts.length;
-  }
-
-  /** The payload that `key` opens, or null. Raises InputError for damage. */
-  async open(key: string, derive: Derive = here): Promise<Payload | null> {
-    const [first, ...others] = await Promise.all([STATIC_SALT, ...this.salts].map((salt) => derive(key, salt)));
-    const salted = others.map(keySecret);
-    const secrets = { fixed: keySecret(first), salted };
-    const headers = this.alignments.map((carriers) => readHeader(secrets, carriers));
-    for (const [index, header] of headers.entries()) {
-      if (header === null) continue;
-      const carriers = this.alignments[index];
-      for (const shift of header.level === ONE ? [0] : [0, shiftOf(header, carriers)]) {
-        const payload = await payloadOf(header, secrets, carriers, shift);
-        if (payload !== null) return payload;
+export function coloursReader(model: Gaussians): Reader {
+  const alignments = Array.from({ length: ALIGNMENTS }, (_, each) => carriersOf(model, each / ALIGNMENTS));
+  const salts = [STATIC_SALT, ...saltsOf(alignments[0])];
+  return {
+    derivations: salts.length,
+    async open(key, derive = here) {
+      const [fixed, ...salted] = (await Promise.all(salts.map((salt) => derive(key, salt)))).map(keySecret);
+      const secrets = { fixed, salted };
+      const headers = alignments.map((carriers) => readHeader(secrets, carriers));
+      for (const [index, header] of headers.entries()) {
+        if (header === null) continue;
+        const carriers = alignments[index];
+        for (const shift of header.level === ONE ? [0] : [0, shiftOf(header, carriers)]) {
+          const payload = await payloadOf(header, secrets, carriers, shift);
+          if (payload !== null) return payload;
+        }
       }
-    }
-    if (headers.some((each) => each !== null)) throw tooMuchLost();
-    return null;
-  }
+      if (headers.some((each) => each !== null)) throw tooMuchLost();
+      return null;
+    },
+  };
 }
 
 /** The payload decrypted by the header's key, or null. */

@@ -10,9 +10,8 @@ import { damaged } from '../../core/errors.ts';
 import { type Gaussians, selected } from '../../core/gaussians.ts';
 import { multiplicities, wordsOf } from '../../core/words.ts';
 import type { ReadModel } from '../../files/models.ts';
-import { type Derive, here } from '../../keys/keys.ts';
 import {
-  checkOf, keySecret, PARAMETER_BYTES, type Parameters, type Payload, type Reader, unpackedParameters, unsealed, unsealedShards,
+  checkOf, PARAMETER_BYTES, type Parameters, type Reader, saltedReader, unpackedParameters, unsealed, unsealedShards,
 } from '../container.ts';
 import { EXACT_BYTES, exactForeign, ID_BYTES } from '../foreign.ts';
 import type { Codewords, Shards } from '../reed_solomon.ts';
@@ -27,135 +26,80 @@ const MAX_BITS = 2 ** 30; // bits in quantised values; more would exceed the mem
 const [KEY_COPIES, PARAMETER_COPIES] = [12, 32]; // places of a part
 const [MAX_LENGTH, MAX_CODEWORDS] = [1 << 10, 1 << 14]; // shards of one codeword
 
-/** The carriers of a model, prepared for any number of keys. */
-export abstract class LsbReader implements Reader {
-  protected constructor(private readonly salts: readonly Uint8Array[]) {}
-
-  /** The reader of quantised values of the model's file or the one it was decoded from, else of low bits; null without capacity. */
-  static async of(model: ReadModel): Promise<LsbReader | null> {
-    const levels = model.codes ? levelsOf(model.codes) : decodedLevels(model);
-    return levels ? BlockReader.ofLevels(levels) : LowBitsReader.ofModel(model);
-  }
-
-  get derivations(): number {
-    return this.salts.length;
-  }
-
-  /** The payload that `key` opens, or null. Raises InputError for damage. */
-  async open(key: string, derive: Derive = here): Promise<Payload | null> {
-    // Other workers derive the next keys while this one reads.
-    const masters = this.salts.map((salt) => derive(key, salt));
-    let found: Payload | null = null;
-    for (const each of masters) {
-      const master = await each;
-      found ??= await this.extract(master);
-    }
-    return found;
-  }
-
-  /** The payload that a key under one salt opens, or null. */
-  protected abstract extract(master: Uint8Array): Promise<Payload | null>;
+/** Of quantised values of the model's file or the one it was decoded from, else of low bits; null without capacity. */
+export async function lsbReader(model: ReadModel): Promise<Reader | null> {
+  const levels = model.codes ? levelsOf(model.codes) : decodedLevels(model);
+  return levels ? blockReader(levels) : lowBitsReader(model);
 }
 
-/** Reads the low bits of Gaussians. */
-class LowBitsReader extends LsbReader {
-  private constructor(
-    salts: readonly Uint8Array[],
-    private readonly fields: number, // in use
-    private readonly low: Uint8Array, // [N, fields] at the greatest depth
-    private readonly table: Table, // at the least depth
-  ) {
-    super(salts);
+async function lowBitsReader(model: Gaussians): Promise<Reader> {
+  let fields = fieldsOf(model);
+  let [ids, low] = [await gaussianIds(model, fields), lowBits(fields)];
+  const used = fields.inUse.length;
+  const rows = uniqueRows(ids, low, used);
+  if (rows.length < model.count) {
+    fields = fieldsOf(selected(model, rows));
+    [ids, low] = [rowsOf(ids, rows, ID_BYTES), lowBits(fields)];
   }
-
-  static async ofModel(model: Gaussians): Promise<LowBitsReader> {
-    let fields = fieldsOf(model);
-    let [ids, low] = [await gaussianIds(model, fields), lowBits(fields)];
-    const rows = uniqueRows(ids, low, fields.inUse.length);
-    if (rows.length < model.count) {
-      fields = fieldsOf(selected(model, rows));
-      [ids, low] = [rowsOf(ids, rows, ID_BYTES), lowBits(fields)];
-    }
-    const used = fields.inUse.length;
-    const table = { ids, low: atDepth(low, used, LEAST), width: lowWidth(used, LEAST) };
-    return new LowBitsReader(salts(fields, ids, table.low, table.width), used, low, table);
-  }
-
-  protected async extract(master: Uint8Array): Promise<Payload | null> {
-    const { width: least, ids } = this.table;
-    const secret = keySecret(master);
-    const dataKey = message(secret, 'key', DATA_KEY_BYTES, Math.min(least, DATA_KEY_BYTES), KEY_COPIES, this.table);
-    const packed = message(dataKey, 'parameters', PARAMETER_BYTES, least, PARAMETER_COPIES, this.table);
+  const tableAt = (depth: number): Table => ({ ids, low: atDepth(low, used, depth), width: lowWidth(used, depth) });
+  /** All shards that seem to be there. */
+  const shardsAt = (depth: number, dataKey: Uint8Array, codewords: Codewords): Shards =>
+    shardsOf(dataKey, codewords, isTagged(lowWidth(used, depth)), tableAt(depth));
+  const table = tableAt(LEAST);
+  return saltedReader(salts(fields, ids, table.low, table.width), async (secret) => {
+    const dataKey = message(secret, 'key', DATA_KEY_BYTES, Math.min(table.width, DATA_KEY_BYTES), KEY_COPIES, table);
+    const packed = message(dataKey, 'parameters', PARAMETER_BYTES, table.width, PARAMETER_COPIES, table);
     const found = unpackedParameters(packed, dataKey);
     if (found === null) {
-      this.shards(dataKey, { count: 1, n: 1, k: 1, width: shardBytes(lowWidth(this.fields, DEEPEST)) }, DEEPEST);
+      shardsAt(DEEPEST, dataKey, { count: 1, n: 1, k: 1, width: shardBytes(lowWidth(used, DEEPEST)) });
       return null;
     }
-    const codewords = this.codewords(found);
-    const shards = this.shards(dataKey, codewords, found.depth);
+    const codewords = codewordsOf(found, used);
+    const shards = shardsAt(found.depth, dataKey, codewords);
     const [record, payload] = await unsealedShards(dataKey, codewords, shards, EXACT_BYTES);
     return { ...payload, foreign: exactForeign(record, dataKey, ids) || undefined };
-  }
-
-  /** The codewords that parameters describe. Raises InputError for impossible ones. */
-  private codewords({ depth, count, n, k }: Parameters): Codewords {
-    const rowBytes = DEPTHS.includes(depth) ? lowWidth(this.fields, depth) : 0;
-    const width = shardBytes(rowBytes);
-    if (width < 1 || count < 1 || count > MAX_CODEWORDS || !isWhole(count, isTagged(rowBytes))) throw damaged();
-    if (k < 1 || k > n || n > MAX_LENGTH) throw damaged();
-    return { count, n, k, width };
-  }
-
-  /** All shards that seem to be there. */
-  private shards(dataKey: Uint8Array, codewords: Codewords, depth: number): Shards {
-    const width = lowWidth(this.fields, depth);
-    const table = { ids: this.table.ids, low: atDepth(this.low, this.fields, depth), width };
-    return shardsOf(dataKey, codewords, isTagged(width), table);
-  }
+  });
 }
 
-/** Reads blocks of quantised values. */
-class BlockReader extends LsbReader {
-  private constructor(
-    salts: readonly Uint8Array[],
-    private readonly ids: Uint8Array, // [C, 16]
-    private readonly low: Uint8Array, // [C, BLOCK_BYTES]
-  ) {
-    super(salts);
-  }
+/** The codewords that parameters describe, for Gaussians with `fields` in use. Raises InputError for impossible ones. */
+function codewordsOf({ depth, count, n, k }: Parameters, fields: number): Codewords {
+  const rowBytes = DEPTHS.includes(depth) ? lowWidth(fields, depth) : 0;
+  const width = shardBytes(rowBytes);
+  if (width < 1 || count < 1 || count > MAX_CODEWORDS || !isWhole(count, isTagged(rowBytes))) throw damaged();
+  if (k < 1 || k > n || n > MAX_LENGTH) throw damaged();
+  return { count, n, k, width };
+}
 
-  static ofLevels(levels: Levels): BlockReader | null {
-    const bits = lastBits(levels);
-    if (bits.length < MIN_BLOCKS * 8 * BLOCK_BYTES || bits.length > MAX_BITS) return null;
-    const low = readBlocks(bits);
-    const numbers = new Uint32Array((ID_BYTES / 4) * (low.length / BLOCK_BYTES));
-    const [ids, hash] = [new Uint8Array(numbers.buffer), modelHash(levels)];
-    for (let block = 0; 4 * block < numbers.length; block++) {
-      numbers[4 * block] = block;
-      ids.set(hash, ID_BYTES * block + 4);
-    }
-    const salt = saltOf(ids.subarray(0, ID_BYTES), low.subarray(0, LEAST_BYTES));
-    return new BlockReader([salt], ids.subarray(ID_BYTES), low.subarray(BLOCK_BYTES));
+/** Of blocks of quantised values; the first gives the salt. */
+function blockReader(levels: Levels): Reader | null {
+  const bits = lastBits(levels);
+  if (bits.length < MIN_BLOCKS * 8 * BLOCK_BYTES || bits.length > MAX_BITS) return null;
+  const table = readBlocks(bits);
+  const numbers = new Uint32Array((ID_BYTES / 4) * (table.length / BLOCK_BYTES));
+  const [every, hash] = [new Uint8Array(numbers.buffer), modelHash(levels)];
+  for (let block = 0; 4 * block < numbers.length; block++) {
+    numbers[4 * block] = block;
+    every.set(hash, ID_BYTES * block + 4);
   }
-
-  protected async extract(master: Uint8Array): Promise<Payload | null> {
-    const [dataKey, blocks] = [keySecret(master), this.low.length / BLOCK_BYTES];
-    const [pads, check] = [parameterPads(dataKey, this.ids), checkOf(dataKey)];
+  const [ids, low] = [every.subarray(ID_BYTES), table.subarray(BLOCK_BYTES)];
+  const blocks = low.length / BLOCK_BYTES;
+  return saltedReader([saltOf(every.subarray(0, ID_BYTES), table.subarray(0, LEAST_BYTES))], async (dataKey) => {
+    const [pads, check] = [parameterPads(dataKey, ids), checkOf(dataKey)];
     let row = -1;
     for (let block = blocks - 1; block >= 0; block--) {
-      if (check.every((each, at) => (this.low[block * BLOCK_BYTES + at] ^ pads[block * PARAMETER_BYTES + at]) === each)) row = block;
+      if (check.every((each, at) => (low[block * BLOCK_BYTES + at] ^ pads[block * PARAMETER_BYTES + at]) === each)) row = block;
     }
     if (row < 0) return null;
-    const packed = pads.slice(row * PARAMETER_BYTES, (row + 1) * PARAMETER_BYTES).map((each, at) => each ^ this.low[row * BLOCK_BYTES + at]);
+    const packed = pads.slice(row * PARAMETER_BYTES, (row + 1) * PARAMETER_BYTES).map((each, at) => each ^ low[row * BLOCK_BYTES + at]);
     const { depth: width, count } = unpackedParameters(packed, dataKey)!;
     if (width < 1 || width > BLOCK_BYTES || count < 1 || count >= blocks) throw damaged();
     const sealed = new Uint8Array(count * width);
     for (let index = 0; index < count; index++) {
       const start = ((row + 1 + index) % blocks) * BLOCK_BYTES;
-      sealed.set(this.low.subarray(start, start + width), index * width);
+      sealed.set(low.subarray(start, start + width), index * width);
     }
     return (await unsealed(dataKey, sealed))[1];
-  }
+  });
 }
 
 /** Rows that differ in ID or low bits. */
