@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from keyss.core.gaussians import SH_C0, Gaussians
-from keyss.core.scene import Camera, Scene
+from keyss.core.scene import Camera
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, CombinedStrategy, Rendered
 from keyss.fitting.image_metrics import psnr, subsample_views
@@ -76,9 +76,10 @@ def starting_points(placed: PlacedScene) -> tuple[Tensor, Tensor]:
 def combined_points(
     scenes: Sequence[PlacedScene], limit: int, fit: FitConfig, generator: torch.Generator
 ) -> tuple[Gaussians, Tensor]:
-    """Gaussians at up to `limit` points of all scenes, in equal shares if there are enough, and [N] the scene.
+    """Gaussians at up to `limit` points of all scenes, and [N] the scene of each.
 
-    They are as wide as the distance to their neighbours in the combined cloud.
+    Scenes have equal shares if they have enough points. Gaussians are as wide as the distance to their
+    neighbours in the combined cloud.
     """
     clouds = [starting_points(placed) for placed in scenes]
     counts = divide([len(points) for points, _ in clouds], limit)
