@@ -9,9 +9,7 @@ import pycolmap
 import pytest
 
 from files.scene_files import camera_bytes, counted, image_bytes, save, write_colmap
-from keyss.core import InputError
 from keyss.files import load_scene
-from keyss.files.lens import make_lens, undistortion
 
 W, H = 160, 120
 MODELS = [
@@ -62,9 +60,3 @@ def test_zero_distortion_keeps_the_photo(tmp_path: Path) -> None:
     view = load_scene(folder).train[0]
     assert view.camera.K.tolist() == [[130, 0, 77], [0, 140, 63], [0, 0, 1]]
     assert view.image[5, 7].tolist() == [7, 5, 0]
-
-
-def test_irreversible_distortion() -> None:
-    lens = make_lens("here", W, H, {"f": 5, "cx": 80, "cy": 60, "k1": -100})
-    with pytest.raises(InputError, match=r"here: the lens distortion .* cannot be undone"):
-        undistortion(lens, "here")

@@ -136,12 +136,16 @@ def test_gsply_reads_ours(tmp_path: Path, suffix: str, degree: int) -> None:
 
 
 @DEGREES
-@pytest.mark.parametrize("version", [3, 4])
-def test_we_read_gsplys_spz(tmp_path: Path, version: int, degree: int) -> None:
+@pytest.mark.parametrize(("suffix", "version"), [("spz", 3), ("spz", 4), ("compressed.ply", 0)])
+def test_we_read_gsplys(tmp_path: Path, suffix: str, version: int, degree: int) -> None:
     write_model(tmp_path / "in.ply", model_of(300, degree))
-    gsply.write_spz(tmp_path / "a.spz", gsply.plyread(tmp_path / "in.ply"), version=version)
-    theirs = of_gsply(gsply.read_spz(tmp_path / "a.spz"), turned=True)
-    assert_close(read_model(tmp_path / "a.spz"), theirs, 1e-5)
+    path, data = tmp_path / f"a.{suffix}", gsply.plyread(tmp_path / "in.ply")
+    if version:
+        gsply.write_spz(path, data, version=version)
+    else:
+        gsply.plywrite(path, data, compressed=True)
+    theirs = of_gsply(GSPLY[suffix](path), turned=suffix == "spz")
+    assert_close(read_model(path), theirs, 1e-5 if version else 1e-4)
 
 
 def test_reads_gsply_spz_version_2(tmp_path: Path) -> None:
@@ -153,14 +157,6 @@ def test_reads_gsply_spz_version_2(tmp_path: Path) -> None:
     assert_close(
         read_model(tmp_path / "a.spz"), of_gsply(gsply.read_spz(tmp_path / "a.spz"), turned=True), 1e-5
     )
-
-
-@DEGREES
-def test_reads_gsply_compressed_ply(tmp_path: Path, degree: int) -> None:
-    write_model(tmp_path / "in.ply", model_of(300, degree))
-    path = tmp_path / "a.compressed.ply"
-    gsply.plywrite(path, gsply.plyread(tmp_path / "in.ply"), compressed=True)
-    assert_close(read_model(path), of_gsply(gsply.plyread(path)), 1e-4)
 
 
 @DEGREES

@@ -25,6 +25,7 @@ from itertools import combinations
 import numpy as np
 
 from keyss.channels import DEEPEST, usable_carriers
+from keyss.channels.lsb.equal_steps import redrawn
 from keyss.core.arrays import Doubles, Flags, Integers, Words32, doubles
 from keyss.core.errors import UsageError
 from keyss.core.gaussians import Gaussians
@@ -387,19 +388,12 @@ def _excess(
         one, other = (np.abs(values[pairs[:, 0], at] - values[pairs[:, 1], at]) for at in (columns, others))
         return int((np.abs(one - np.where(moved > 0, moved, other)) < cells / _PART).sum())
 
-    drawn = [hits(_redrawn(own, usable, random)) for _ in range(_DRAWS)]
+    drawn = [hits(redrawn(own, usable, DEEPEST, random)) for _ in range(_DRAWS)]
     expected = float(np.mean(drawn))
     if expected < _MIN_EXPECTED:
         return NOTHING
     error = max(1.0, expected**0.5, float(np.std(drawn)))
     return normal((hits(own) - expected) / error, 1.0)
-
-
-def _redrawn(words: Words32, chosen: Flags, random: np.random.Generator) -> Words32:
-    new, mask = words.copy(), _LOW_MASK - np.uint32(1)
-    drawn = random.integers(0, 1 << DEEPEST, words[chosen].shape, np.uint32) << np.uint32(1)
-    new[chosen] = new[chosen] & ~mask | drawn
-    return new
 
 
 def _middle(words: Words32) -> Doubles:

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import bdtrc, chdtrc, ndtr, pdtrc
 
+from keyss.channels.lsb.bits import bit_patterns
 from keyss.core.arrays import Flags, Integers, Numbers, Words32
 from keyss.core.gaussians import Gaussians
 
@@ -31,8 +32,8 @@ class BitPatterns:
     @staticmethod
     def of(model: Gaussians) -> BitPatterns:
         fields = [model.means, model.log_scales, model.quats, model.opacity_logits[:, None]]
-        fields += [model.sh[:, band**2 : (band + 1) ** 2].flatten(1) for band in range(model.sh_degree + 1)]
-        parts = [field.detach().cpu().float().contiguous().numpy().view(np.uint32) for field in fields]
+        fields += [model.sh[:, band**2 : (band + 1) ** 2] for band in range(model.sh_degree + 1)]
+        parts = [bit_patterns(field.contiguous()) for field in fields]
         attribute = np.repeat(np.arange(len(parts)), [part.shape[1] for part in parts])
         return BitPatterns(np.concatenate(parts, axis=1), attribute)
 
