@@ -1,19 +1,27 @@
+"""Key derivation and encryption, by their definitions and by known answers."""
+
 from __future__ import annotations
 
 import hashlib
 import hmac
+import json
 import string
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from argon2.low_level import Type, hash_secret_raw
 
-from keyss.core import InputError, UsageError
-from keyss.keys import ALPHABET, DerivedKey, MasterKey, generate_key
+from keyss.core import InputError, UsageError, errors
+from keyss.keys import ALPHABET, DerivedKey, MasterKey, encryption, generate_key
 
 pytestmark = pytest.mark.argon2
 
 SALT = b"0123456789abcdef"
+FOLDER = Path(__file__).parents[1] / "vectors"
+DERIVATION = json.loads((FOLDER / "derivation.json").read_text())
+ENCRYPTION = json.loads((FOLDER / "encryption.json").read_text())
 
 
 def _expand(key: str, label: bytes, length: int) -> bytes:
@@ -99,3 +107,41 @@ def test_asset_keys_are_uniform() -> None:
 def test_invalid_names(name: str) -> None:
     with pytest.raises(UsageError):
         MasterKey("a master key").key_of(name)
+
+
+def _derived(vector: dict[str, Any]) -> DerivedKey:
+    return DerivedKey.of(vector["key"], bytes.fromhex(vector["salt"]))
+
+
+@pytest.mark.parametrize("vector", DERIVATION["valid"], ids=lambda vector: ascii(vector["key"]))
+def test_derivation(vector: dict[str, Any]) -> None:
+    key = _derived(vector)
+    assert key.verifier().hex() == vector["verifier"]
+    for label in ("writer", "channel/key"):
+        assert key.expand(label, 32).hex() == vector[label]
+    assert key.embedding()[:4].tolist() == pytest.approx(vector["embedding_first_4"], abs=2e-6)
+
+
+@pytest.mark.parametrize("vector", DERIVATION["invalid"], ids=lambda vector: vector["why"])
+def test_derivation_that_must_fail(vector: dict[str, Any]) -> None:
+    with pytest.raises(getattr(errors, vector["error"])):
+        _derived(vector)
+
+
+def test_encryption() -> None:
+    vector = ENCRYPTION["valid"]
+    data_key, associated = (bytes.fromhex(vector[name]) for name in ("data_key", "associated"))
+    for name in ("encrypted", "stored"):
+        payload = encryption.decrypt(data_key, bytes.fromhex(vector[name]), associated)
+        assert payload.hex() == vector["payload"]
+
+
+@pytest.mark.parametrize("vector", ENCRYPTION["invalid"], ids=lambda vector: vector["why"])
+def test_invalid_encrypted_data(vector: dict[str, Any]) -> None:
+    good = ENCRYPTION["valid"]
+    with pytest.raises(getattr(errors, vector["error"]), match=vector["words"]):
+        encryption.decrypt(
+            bytes.fromhex(good["data_key"]),
+            bytes.fromhex(vector["encrypted"]),
+            bytes.fromhex(good["associated"]),
+        )

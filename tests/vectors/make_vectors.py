@@ -9,11 +9,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import sys
 import unicodedata
+import warnings
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 FOLDER = Path(__file__).parent
 STRIDE = 49
@@ -30,10 +34,21 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 from channels.lsb import quantised  # noqa: E402
 from channels.lsb.trained_like import trained_like  # noqa: E402
 from files.formats.examples import model_of, random_compressed, random_sog, random_spz  # noqa: E402
-from keyss.channels import LOW_BITS, SUFFIXES, Payload, channel_for, in_counted_order, last_bits, open_payload  # noqa: E402
+from keyss.channels import (  # noqa: E402
+    APPENDED,
+    COLOURS,
+    LOW_BITS,
+    SUFFIXES,
+    Payload,
+    channel_for,
+    in_counted_order,
+    last_bits,
+    open_payload,
+)
+from keyss.channels.colours import planner  # noqa: E402
 from keyss.channels.lsb.decoded import Decoded  # noqa: E402
 from keyss.channels.lsb.fields import _log2  # noqa: E402
-from keyss.core import Gaussians, Similarity  # noqa: E402
+from keyss.core import Gaussians, KeyssWarning, Similarity  # noqa: E402
 from keyss.files import read_model, write_model  # noqa: E402
 from keyss.files.formats import splat  # noqa: E402
 from keyss.files.formats.common import CodedGaussians  # noqa: E402
@@ -43,9 +58,12 @@ from keyss.files.formats.spz import SpzCodes  # noqa: E402
 from keyss.keys import random_embeddings  # noqa: E402
 from keyss.methods import CarriedSecret, Decoder, DecoderShape, HiddenFile, KeyssSecret, choose_anchors  # noqa: E402
 from keyss.methods.codec.model_bytes import BLOCK, decode, encode  # noqa: E402
+from lab.lifelike import lifelike  # noqa: E402
 from methods.carry.carried import embed  # noqa: E402
 from methods.keyss.small import make_secret  # noqa: E402
-from vectors.surviving import NAMES, write_surviving  # noqa: E402
+
+SURVIVING = ("appended.ply", "appended-moved.spz", "colours.spz", "colours-moved.splat")
+NOTE = HiddenFile("a note.txt", b"Written at noon, read at night.\n")
 
 
 def derivation() -> dict[str, object]:
@@ -263,6 +281,38 @@ def digests(model: Gaussians) -> dict[str, str]:
     return {each: hashlib.sha256(np.ascontiguousarray(v)).hexdigest() for each, v in columns.items()}
 
 
+def write_surviving() -> None:
+    """Models and files in appended Gaussians and in colours, which survive conversion."""
+    ply, spz, one, moved = (FOLDER / name for name in SURVIVING)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", KeyssWarning)  # of more secrets than one
+        write_model(ply, with_appended(TWO_KEYS))
+    model = with_appended(TWO_KEYS[:1])
+    rows = torch.randperm(len(model), generator=torch.Generator().manual_seed(21))
+    write_model(spz, elsewhere(model[rows[: 9 * len(rows) // 10]]))
+    cover = lifelike(4000, 22).with_sh_degree(0)
+    notes = [(TWO_KEYS[0], NOTE.payload()), (TWO_KEYS[1], Payload("file", b"\0" + b"?" * 9))]
+    write_model(one, COLOURS.prepare(cover).embed(notes, entropy=bytes(32)))
+    secret = Payload("carry", encode(trained_like(12, 25, 0)))
+    with mock.patch.object(planner, "STRENGTH", 40.0):
+        small = COLOURS.prepare(cover[:2300]).embed([(TWO_KEYS[0], secret)], entropy=bytes(32))
+    write_model(moved, elsewhere(small))
+
+
+def with_appended(keys: Sequence[str]) -> Gaussians:
+    """A cover in which half of the Gaussians are faint."""
+    cover = trained_like(120, 23, 0)
+    cover = replace(cover, opacity_logits=torch.where(torch.arange(120) % 2 == 0, -5.5, 2.0))
+    payloads = [Payload("carry", encode(trained_like(40, 24, 1))), NOTE.payload()]
+    return APPENDED.prepare(cover).embed(list(zip(keys, payloads, strict=False)), entropy=bytes(32))
+
+
+def elsewhere(model: Gaussians) -> Gaussians:
+    """Apply a similarity transform."""
+    rotation = torch.from_numpy(Rotation.from_euler("xyz", [1.0, 2.0, 3.0]).as_matrix())
+    return Similarity(math.pi / 2, rotation, torch.tensor([3.0, -2.0, 1.0])).apply_gaussians(model)
+
+
 def write_revealed(key: str) -> None:
     write_model(FOLDER / "pruned.ply", pruned_model())
     opened = [open_file(name, key) for name in ("carried.ply", "keyss.ply")]
@@ -274,9 +324,9 @@ def write_revealed(key: str) -> None:
         opened += [open_file(f"coded{suffix}", key) for key in TWO_KEYS]
         write_decoded(suffix)
         opened.append(open_file(f"decoded-{suffix.split('.')[1]}.ply", TWO_KEYS[0]))
-    write_surviving(FOLDER, TWO_KEYS)
-    opened += [open_file(name, TWO_KEYS[0]) for name in NAMES]
-    opened += [open_file(name, TWO_KEYS[1]) for name in NAMES[:3:2]]
+    write_surviving()
+    opened += [open_file(name, TWO_KEYS[0]) for name in SURVIVING]
+    opened += [open_file(name, TWO_KEYS[1]) for name in SURVIVING[:3:2]]
     (FOLDER / "revealed.json").write_text(json.dumps(opened, indent=1) + "\n")
 
 

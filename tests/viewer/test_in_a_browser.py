@@ -24,7 +24,6 @@ AXE = WEB / "node_modules" / "axe-core" / "axe.min.js"
 def served(stego: Path) -> Iterator[str]:
     """The address of `keyss view`."""
     with subprocess.Popen([*KEYSS, "view", str(stego)], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
         try:
             line = process.stdout.readline()
             found = re.match(r"(http://127\.0\.0\.1:[0-9]+/\S+/) .*only on this machine", line)

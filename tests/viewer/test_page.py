@@ -67,9 +67,7 @@ def test_single_file_page(model: Path, tmp_path: Path) -> None:
     (out,) = export_html(model, tmp_path / "page.html")
     page = out.read_text()
     policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)
-    assert policy is not None
     script = re.search(r"<script>(.*?)</script>", page, re.DOTALL)
-    assert script is not None
     assert script[1] == asset("viewer.js").decode()  # contains no </script>
     digest = b64encode(hashlib.sha256(script[1].encode()).digest()).decode()
     assert f"script-src &#x27;sha256-{digest}&#x27;" in policy[1]
@@ -77,7 +75,6 @@ def test_single_file_page(model: Path, tmp_path: Path) -> None:
     assert "unsafe-inline" not in policy[1]
     assert "unsafe-eval" not in policy[1].replace("wasm-unsafe-eval", "")
     data = re.search(r'data-name="a model &amp; &lt;more&gt;.ply">([^<]*)</script>', page)
-    assert data is not None
     assert b64decode(data[1]) == model.read_bytes()
     assert "PlayCanvas" in page
     assert not re.search(r'(src|href)="', page)
@@ -135,7 +132,6 @@ def test_server(server: ModelServer, model: Path) -> None:
     assert status == 200
     assert headers["Content-Security-Policy"].startswith("default-src 'self';")
     name = re.search(rb'name="keyss-model" content="([^"]*)"', page)
-    assert name is not None
     assert get(server, name[1].decode())[1] == model.read_bytes()
     assert get(server, "viewer.js")[1] == asset("viewer.js")
     for path in ("model/", "model/..%2f..%2fetc/passwd", "../../etc/passwd", "page.html", "a/b"):

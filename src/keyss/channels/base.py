@@ -91,4 +91,3 @@ class Channel:
     prepare: Callable[[Gaussians], PreparedCover]
     estimate_capacity: Callable[[int, int], Capacity]  # of so many Gaussians of an SH degree, not fitted yet
     survives: bool = False  # True if secrets survive conversion to other formats
-    grows: bool = False  # see `Capacity`

@@ -58,26 +58,16 @@ class Payload:
 
 
 def pack_payload(payload: Payload) -> bytes:
-    """Name of the method, zero byte, data. Raises ValueError for an impossible name."""
-    return _checked(payload.method.encode("ascii")) + b"\0" + payload.data
+    """Name of the method, zero byte, data."""
+    return payload.method.encode("ascii") + b"\0" + payload.data
 
 
 def unpack_payload(packed: bytes) -> Payload:
     """Invert `pack_payload`. Raises InputError for anything else."""
     name, zero, data = packed.partition(b"\0")
-    try:
-        method = _checked(name).decode("ascii")
-    except ValueError as error:
-        raise InputError("the hidden data are damaged: they do not begin with a method's name") from error
-    if not zero:
-        raise InputError("the hidden data are damaged: they are incomplete")
-    return Payload(method, data)
-
-
-def _checked(name: bytes) -> bytes:
-    if not 1 <= len(name) <= METHOD_BYTES:
-        raise ValueError(f"expected the name of a method, 1 to {METHOD_BYTES} characters, got {name!r}")
-    return name
+    if not (zero and name.isascii() and 1 <= len(name) <= METHOD_BYTES):
+        raise InputError("the hidden data are damaged: they do not begin with a method's name")
+    return Payload(name.decode("ascii"), data)
 
 
 def sealed_size(payload: Payload, record_bytes: int = 0) -> int:

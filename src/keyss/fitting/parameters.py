@@ -18,6 +18,7 @@ from keyss.fitting.adam import RowAdam
 from keyss.fitting.config import FitConfig
 
 INITIAL_OPACITY = 0.1
+MIN_POINTS = 100  # scenes with fewer points start from others
 # Names of parameters, in the order of the fields of `Gaussians`.
 _NAMES = ("means", "quats", "scales", "opacities", "sh")
 
@@ -81,10 +82,10 @@ def initial_gaussians(
 def initial_points(scene: Scene, limit: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Points [P, 3] and colours [P, 3] uint8 to start from: the scene's own, or random ones.
 
-    A scene with fewer than 100 points (NeRF-synthetic has none) gets grey ones, sampled uniformly from a cube
+    A scene with fewer than MIN_POINTS (NeRF-synthetic has none) gets grey ones, sampled uniformly from a cube
     around the focus of the cameras, whose edge is their mean distance from it.
     """
-    if len(scene.points) >= 100:
+    if len(scene.points) >= MIN_POINTS:
         return scene.points, scene.colors
     cameras = [view.camera for view in scene.train]
     focus = focus_point(cameras)

@@ -173,7 +173,7 @@ class MethodOptions:
         try:
             return use(channel)
         except UsageError as refusal:
-            if channel.grows:
+            if channel is APPENDED:
                 raise
             if self.publish or self.format:
                 cure = '`channel="appended"`' if channel.survives else '`publish="converted"`'

@@ -81,7 +81,6 @@ def test_every_size_comes_back(cover: Gaussians, size: int, seed: int) -> None:
     data = np.random.default_rng(seed).bytes(size)
     stego = embedded(cover, [(KEY, Payload("carry", data))], entropy=seed.to_bytes(32, "little"))
     reader = AppendedReader.of(stego)
-    assert reader is not None
     assert reader.open(KEY) == Payload("carry", data)
     shorter = METHOD_BYTES - len("carry")  # the count is that of the longest name
     assert len(stego) - len(cover) == appended_count([len(data) - shorter])
@@ -131,27 +130,20 @@ def test_many_faint_gaussians_that_do_not_agree_cost_little(moved: bool) -> None
     assert time.process_time() - began < 8
 
 
-@pytest.mark.parametrize("key", [KEY, "Rosebud, 1942"])
-def test_a_wrong_key_takes_as_many_derivations_as_a_right_one(cover: Gaussians, key: str) -> None:
+def test_a_wrong_key_takes_as_many_derivations_as_a_right_one(stego: Gaussians) -> None:
     """They are nearly all of the time."""
-    reader = AppendedReader.of(embedded(cover, [(KEY, Payload("file", DATA))], entropy=ENTROPY))
-    assert reader is not None
     derivation._argon2id.cache_clear()  # the writer has derived the right one
     with mock.patch.object(derivation, "hash_secret_raw", wraps=derivation.hash_secret_raw) as derived:
-        try:
-            assert reader.open(key) == Payload("file", DATA)
-            assert key == KEY
-        except WrongKeyError:
-            assert key != KEY
-    assert derived.call_count == 1
+        assert opened(stego) == DATA
+        with pytest.raises(WrongKeyError):
+            opened(stego, "Rosebud, 1942")
+    assert derived.call_count == 2
 
 
 def test_no_two_files_share_anything(cover: Gaussians) -> None:
     """From equal entropy too: what is hidden is mixed in."""
     two = [embedded(cover, [(KEY, Payload("file", data))], entropy=ENTROPY) for data in (b"a", b"b")]
     readers = [AppendedReader.of(each[len(cover) :]) for each in two]
-    assert readers[0] is not None
-    assert readers[1] is not None
     assert readers[0].salts != readers[1].salts
     assert not {*map(bytes, readers[0].words)} & {*map(bytes, readers[1].words)}
 
@@ -159,7 +151,6 @@ def test_no_two_files_share_anything(cover: Gaussians) -> None:
 def test_words_look_random(stego: Gaussians, cover: Gaussians) -> None:
     """Every bit of what is appended is as often set as not, whatever lies there; no two bits go together."""
     reader = AppendedReader.of(stego[len(cover) :])
-    assert reader is not None
     bits = reader.words.astype(np.float64) * 2 - 1
     deviation = 1 / len(bits) ** 0.5
     assert np.abs(bits.mean(axis=0)).max() < 4.5 * deviation
@@ -203,10 +194,7 @@ def test_it_opens_from_every_format(suffix: str, stego: Gaussians, tmp_path: Pat
 
 @pytest.mark.parametrize("suffix", [".spz", pytest.param(".sog", marks=pytest.mark.slow), ".compressed.ply"])
 def test_it_opens_from_what_splat_transform_writes(
-    splat_transform: Callable[..., Path],
-    suffix: str,
-    stego: Gaussians,
-    tmp_path: Path,
+    splat_transform: Callable[..., Path], suffix: str, stego: Gaussians, tmp_path: Path
 ) -> None:
     write_model(tmp_path / "a.ply", stego)
     options = ["-i", "1"] if suffix == ".sog" else []
@@ -370,7 +358,6 @@ def test_equal_rotations_are_in_random_order(cover: Gaussians) -> None:
         stego = embedded(cover, [(KEY, Payload("file", DATA * 5))], entropy=bytes([seed] * 32))
         appended = stego[len(cover) :]
         reader = AppendedReader.of(appended)
-        assert reader is not None
         words = reader.words
         rotations = words[:, -15:] @ (1 << np.arange(15))
         invariants = (words[:, :39] @ (1 << np.arange(39)[::-1])).astype(np.uint64)

@@ -24,8 +24,4 @@ def embed(
 
 
 def extract(stego: Gaussians, key: str) -> bytes:
-    reader = ColoursReader.of(stego)
-    assert reader is not None
-    content = reader.open(key)
-    assert isinstance(content, Payload)
-    return content.data
+    return ColoursReader.of(stego).open(key).data

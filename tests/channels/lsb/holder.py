@@ -32,7 +32,6 @@ def seen_by_holder(stego: Gaussians, key: str) -> dict[str, float]:
         packed, parameter_rows = _read(parameter_message(data_key, low.shape[1]), ids, low)
         if (parameters := Parameters.unpack(packed, data_key)) is not None:  # else the salt is stale
             break
-    assert parameters is not None
     codewords, rows = codewords_of(parameters, layout), read_low_bits(stego, parameters.depth, layout)
     own, numbers, _ = Shards(data_key, codewords, is_tagged(rows.shape[1])).decrypt(ids, rows)
     where = np.flatnonzero(own)

@@ -46,18 +46,13 @@ def _least_chance(alone: list[list[float]], beside: list[list[float]]) -> float:
 
 @pytest.mark.parametrize(
     ("own", "others"),
-    [
-        ("quarter", ["quarter"]),
-        (2000, ["quarter", 3000, 1]),
-        ("half", ["quarter", 100]),
-        (2000, ["half"]),
-    ],
+    [("quarter", ["quarter"]), (2000, ["quarter", 3000, 1]), ("half", ["quarter", 100]), (2000, ["half"])],
     ids=["quarters", "four secrets", "half beside quarters", "quarter beside half"],
 )
 def test_secrets_lie_as_if_they_were_alone(own: Size, others: list[Size]) -> None:
     alone = [_seen([own]) for _ in range(HIDINGS)]
     beside = [_seen([own, *others]) for _ in range(HIDINGS)]
-    assert _least_chance(alone, beside) > 1e-5
+    assert _least_chance(alone, beside) > 1e-8  # of 40 tests in all: one false alarm in two million runs
 
 
 def test_who_is_crowded_is_warned_for_it_can_be_seen() -> None:

@@ -66,11 +66,7 @@ def test_gsply_reads_it(name: str, tmp_path: Path) -> None:
 
 
 @EVERY
-def test_splat_transform_reads_it(
-    splat_transform: Callable[..., Path],
-    name: str,
-    tmp_path: Path,
-) -> None:
+def test_splat_transform_reads_it(splat_transform: Callable[..., Path], name: str, tmp_path: Path) -> None:
     both = [
         read_model(splat_transform(each, tmp_path / f"{index}.ply"))
         for index, each in enumerate(files(name, tmp_path))

@@ -325,7 +325,6 @@ def test_the_blocks_of_one_file_are_of_no_use_in_another(suffix: str) -> None:
     table = read_blocks(bits_of(first))[:, : host.width]
     table = np.resize(table, (len(host.ids), host.width))
     bits = host._solve(table, SECRET)
-    assert bits is not None
     copied = host._model_to_publish(host._with_bits(bits, SECRET), SECRET).codes
     assert np.array_equal(read_blocks(bits_of(copied))[:40, : host.width], table[:40])
     with pytest.raises(WrongKeyError):

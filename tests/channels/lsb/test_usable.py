@@ -199,9 +199,7 @@ PREDICTABLE = (
 
 
 @pytest.mark.parametrize("change", PREDICTABLE)
-def test_predictable_gaussians_stay_as_they_are(
-    change: Callable[[Gaussians], tuple[Gaussians, Any]],
-) -> None:
+def test_predictable_gaussians_stay_as_they_are(change: Callable[[Gaussians], tuple[Gaussians, Any]]) -> None:
     model, rows = change(trained_like(3000, 5))
     usable = usable_carriers(model)
     assert not usable[rows].any()

@@ -59,7 +59,6 @@ def test_solutions_are_random_where_bits_were() -> None:
     dry = np.tile((rng.random(BLOCK) < 0.9).astype(np.uint8), count)
     before = rng.integers(0, 2, count * BLOCK).astype(np.uint8) * dry
     found = write(before, dry, rng.integers(0, 2, (count, 840)).astype(np.uint8))
-    assert found is not None
     total = found.reshape(count, BLOCK)[:, dry[:BLOCK] == 1].sum(axis=0)
     deviation = (total - count / 2) / (count / 4) ** 0.5
     assert np.abs(deviation).max() < 5.5

@@ -28,12 +28,14 @@ def hidden() -> Hidden:
     return hide_scenes(scenes, KEYS, small("published"), plains=models)
 
 
+def _scenes() -> list[PlacedScene]:
+    return [PlacedScene.of(tiny_scene(each), random_gaussians(seed=each), Similarity()) for each in range(3)]
+
+
 def _run(design: str = "published", **changes: Any) -> KeyssTraining:
     options = small(design, **changes)
     options = options.with_fit(ssim_weight=options.configuration.ssim_weight)
-    scenes = [
-        PlacedScene.of(tiny_scene(each), random_gaussians(seed=each), Similarity()) for each in range(3)
-    ]
+    scenes = _scenes()
     return KeyssTraining(scenes, list(VECTORS[:2]), options, torch.device("cpu"))
 
 
@@ -163,6 +165,30 @@ def test_start_leaves_room_for_growth() -> None:
     means, widths = run.parameters["means"].detach(), run.parameters["scales"].detach().exp()[:, 0]
     nearest = torch.cdist(means, means).topk(4, largest=False).values[:, 1:]
     torch.testing.assert_close(widths, nearest.square().mean(1).sqrt(), rtol=1e-3, atol=1e-4)
+
+
+def test_scene_without_points_starts_from_its_plain_model() -> None:
+    scenes = _scenes()
+    bare = replace(scenes[1].scene, points=torch.empty(0, 3), colors=torch.empty(0, 3, dtype=torch.uint8))
+    scenes[1] = replace(scenes[1], scene=bare)
+    run = KeyssTraining(scenes, list(VECTORS[:2]), small("published"), torch.device("cpu"))
+    means = run.parameters["means"].detach()
+    for scene, points in enumerate((scenes[0].scene.points, scenes[1].plain.means, scenes[2].scene.points)):
+        own = means[run.scene_of_point == scene]
+        assert len(own) >= 40
+        assert {tuple(point) for point in own.tolist()} <= {tuple(point) for point in points.tolist()}
+
+
+def test_pretrained_decoder_shows_each_scene_its_own_points() -> None:
+    run = KeyssTraining(_scenes()[:2], list(VECTORS[:1]), KeyssOptions(fit=FIT), torch.device("cpu"))
+    cover = run.cover().detach()
+    with torch.no_grad():
+        secret, wrong = run.secret(cover, 1), run.decoder(cover, VECTORS[2])
+    for scene, model in enumerate((cover, secret)):
+        own = run.scene_of_point == scene
+        assert model.opacities[own].median() > 0.08
+        assert model.opacities[~own].median() < 0.01
+    torch.testing.assert_close(wrong.opacities, cover.opacities, atol=0.03, rtol=0)
 
 
 @pytest.mark.parametrize(("iterations", "boost"), [(60, 5.0), (30_000, 1.0)])

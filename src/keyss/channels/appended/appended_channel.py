@@ -97,7 +97,7 @@ def _capacity(gaussians: int, sh_degree: int) -> Capacity:
     return Capacity.of_sealed(_OVERHEAD, [(1.0, MAX_BYTES)], lambda count: MAX_BYTES // count, grows=True)
 
 
-APPENDED = Channel("appended Gaussians", AppendedCover.of, _capacity, survives=True, grows=True)
+APPENDED = Channel("appended Gaussians", AppendedCover.of, _capacity, survives=True)
 
 
 def appended_count(sizes: Sequence[int]) -> int:

@@ -92,15 +92,12 @@ def read(invariants: Words, means: Doubles) -> PilotFit | None:
     inliers = _inliers(world, expected, triples, some)
     best = some[inliers[inliers.sum(axis=1).argmax()]]
     for _ in range(3):
-        if len(best) < _MIN_INLIERS:
-            return None
-        best = np.flatnonzero(_inliers(world, expected, best))
-    if len(best) < _MIN_INLIERS:
-        return None
-    scale, rotation, translation = _similarities(world[best], expected[best])
-    salt = _salt(invariants[pilots[best]])
+        if len(best) >= _MIN_INLIERS:
+            best = np.flatnonzero(_inliers(world, expected, best))
+    salt = _salt(invariants[pilots[best]]) if len(best) >= _MIN_INLIERS else None
     if salt is None:
         return None
+    scale, rotation, translation = _similarities(world[best], expected[best])
     to_own = Similarity(float(scale), torch.from_numpy(rotation), torch.from_numpy(translation))
     return PilotFit(to_own, len(best), salt)
 

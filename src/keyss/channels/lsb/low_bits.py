@@ -134,12 +134,7 @@ class LowBitsCover:
         raise AssertionError
 
     def _headers(
-        self,
-        attempt: int,
-        plan: Allocation,
-        keys: Sequence[Sequence[DerivedKey]],
-        free: Flags,
-        secret: bytes,
+        self, attempt: int, plan: Allocation, keys: Sequence[Sequence[DerivedKey]], free: Flags, secret: bytes
     ) -> tuple[list[Part], list[bytes]]:
         """The headers of all payloads, and their data keys; their places are not `free` [N] any more.
 

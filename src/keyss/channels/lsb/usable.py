@@ -26,23 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from keyss.channels.lsb.bits import (
-    ATTRIBUTES,
-    BLOCK,
-    DEEPEST,
-    DEPTHS,
-    HARMONICS,
-    LEAST,
-    LOW,
-    OPACITIES,
-    QUATS,
-    SCALES,
-    UNIT_TOLERANCE,
-    Layout,
-    coarse_lengths,
-    exponents,
-    gaussian_ids,
-)
+from keyss.channels.lsb import bits
 from keyss.channels.lsb.equal_steps import Steps
 from keyss.channels.lsb.trailing_zeros import count_trailing_zeros, least_exponent
 from keyss.channels.mixing import row_hashes
@@ -58,7 +42,8 @@ MAX_SEPARATION = 0.03
 _MAGNITUDE = np.uint32(0x7FFFFFFF)
 # Bit patterns of logits above 16. The sigmoid is 1 above 16.64, but only the exponent never changes.
 _SATURATED = np.uint32(0x41800000), np.uint32(0x80000000)
-_PRUNED = np.float32(math.log(0.005 / 0.995)).view(np.uint32) | LOW  # the logit of 0.005, without low bits
+# The logit of 0.005 without low bits.
+_PRUNED = np.float32(math.log(0.005 / 0.995)).view(np.uint32) | bits.LOW
 _MIN_USABLE = 0.05  # share of the Gaussians of a cover
 _SHORT = 5  # numbers without low bits; by chance in one of ten million Gaussians
 _SETS_BY_CHANCE = 0.1  # maximum expected number of sets of equal values by chance
@@ -79,35 +64,35 @@ class Carriers:
     renewable: Flags  # [N] mask of those that may be written at the least depth, as salts are
 
     @staticmethod
-    def of(gaussians: Gaussians, layout: Layout) -> Carriers:
+    def of(gaussians: Gaussians, layout: bits.Layout) -> Carriers:
         """Raises UsageError, with what shows, if new low bits would show even at the least depth.
 
         A sample of a large cover is tested first: the whole takes 0.7 s for each 100,000 Gaussians.
         """
         if len(gaussians) > _LARGE:
             sample = gaussians[:: len(gaussians) // _SAMPLE]
-            Carriers.of(sample, Layout.of(sample))
-        ids = gaussian_ids(gaussians, layout)
+            Carriers.of(sample, bits.Layout.of(sample))
+        ids = bits.gaussian_ids(gaussians, layout)
         fine = _without_coincidences(gaussians, layout, ids)
         steps = Steps(gaussians, layout)
-        equal = steps.equal(DEEPEST)
+        equal = steps.equal(bits.DEEPEST)
         fine &= _without_small_even(gaussians, layout, fine & ~equal)
         usable, deepest = fine & ~equal, 0
-        for depth in DEPTHS:
+        for depth in bits.DEPTHS:
             if told := _what_tells(gaussians, layout, usable, depth, steps):
-                if depth == LEAST:
+                if depth == bits.LEAST:
                     raise UsageError(told)
                 break
             deepest = depth
-        return Carriers(ids, usable, deepest, fine & ~steps.equal(LEAST, equal))
+        return Carriers(ids, usable, deepest, fine & ~steps.equal(bits.LEAST, equal))
 
 
 def usable_carriers(gaussians: Gaussians) -> Flags:
     """Mask [N] of the usable Gaussians. Raises UsageError as `Carriers.of`."""
-    return Carriers.of(gaussians, Layout.of(gaussians)).usable
+    return Carriers.of(gaussians, bits.Layout.of(gaussians)).usable
 
 
-def _what_tells(gaussians: Gaussians, layout: Layout, usable: Flags, depth: int, steps: Steps) -> str:
+def _what_tells(gaussians: Gaussians, layout: bits.Layout, usable: Flags, depth: int, steps: Steps) -> str:
     """What tells new low bits of `usable` [N] Gaussians from the model's own; empty for nothing.
 
     Tested on at most 20,000 Gaussians: see `chance_of_bits` and `Steps.chance`.
@@ -125,18 +110,12 @@ def _what_tells(gaussians: Gaussians, layout: Layout, usable: Flags, depth: int,
         for name, words in groups.items():
             if words.size:
                 relation = f"the low bits of {name} in this cover are not random"
-                yield (
-                    chance_of_bits(words, depth + 1),
-                    relation,
-                    "quantised, scaled or moved after its training",
-                )
-        if depth == LEAST:
+                cause = "quantised, scaled or moved after its training"
+                yield chance_of_bits(words, depth + 1), relation, cause
+        if depth == bits.LEAST:
             relation = "harmonics of this cover are multiples of one step"
-            yield (
-                chance_of_lattice(groups[HARMONICS]),
-                relation,
-                "multiplied, as by an edit of its brightness",
-            )
+            cause = "multiplied, as by an edit of its brightness"
+            yield chance_of_lattice(groups[bits.HARMONICS]), relation, cause
         relation = "numbers of this cover predict each other's low bits"
         cause = "hardly trained, or seen from one direction, so that they moved by equal steps"
         yield steps.chance(depth, usable), relation, cause
@@ -147,17 +126,17 @@ def _what_tells(gaussians: Gaussians, layout: Layout, usable: Flags, depth: int,
     return ""
 
 
-def chance_of_bits(words: Words32, bits: int) -> float:
-    """p-value of bits 1 to `bits` - 1 of words [...] under the null hypothesis of uniform bits.
+def chance_of_bits(words: Words32, width: int) -> float:
+    """p-value of bits 1 to `width` - 1 of words [...] under the null hypothesis of uniform bits.
 
     Exact binomial tests of each bit given exponent, last bit and the bit below, Bonferroni-corrected.
     """
     from scipy.special import bdtr  # takes long to load
 
-    ends = exponents(words).astype(np.int64) << bits | words & np.uint32((1 << bits) - 1)
-    counts = np.bincount(ends.ravel(), minlength=256 << bits)
+    ends = bits.exponents(words).astype(np.int64) << width | words & np.uint32((1 << width) - 1)
+    counts = np.bincount(ends.ravel(), minlength=256 << width)
     chances: list[Doubles] = []
-    for bit in range(1, bits):
+    for bit in range(1, width):
         # Axes: exponent, bits above, this bit, the bit below, bits between, last bit (of bit 1, that below).
         last = 2 if bit > 1 else 1
         given = counts.reshape(256, -1, 2, 2, (1 << bit - 1) // last, last).sum(axis=(1, 4))
@@ -182,7 +161,7 @@ def chance_of_lattice(harmonics: Words32) -> float:
     chances = [1.0]
     for colour in range(3 if harmonics.size else 0):
         words = harmonics[:, colour::3].ravel()
-        binades = exponents(words)
+        binades = bits.exponents(words)
         words = words[binades == np.bincount(binades).argmax()]
         mantissas = (words >> np.uint32(1)) & np.uint32(_MANTISSAS - 1)  # the last bit is never written
         counts = np.bincount(mantissas, minlength=_MANTISSAS).astype(np.float32).reshape(-1, _WINDOW)
@@ -194,42 +173,42 @@ def chance_of_lattice(harmonics: Words32) -> float:
     return float(min(chances))
 
 
-def _without_coincidences(gaussians: Gaussians, layout: Layout, ids: Bytes) -> Flags:
+def _without_coincidences(gaussians: Gaussians, layout: bits.Layout, ids: Bytes) -> Flags:
     """Mask [N] of Gaussians without shared, frequent, nearly equal, saturated, nearly pruned, short and unit
     numbers."""
     groups, fine = layout.groups(gaussians), np.ones(len(gaussians), bool)
     common = {name: frequent(words, _unlikely_copies(words.size)) for name, words in groups.items()}
-    shared = [groups[name] for name in (SCALES, QUATS) if name in groups]
-    shared += [groups[HARMONICS][:, colour:9:3] for colour in range(3 if layout.sh_degree else 0)]
+    shared = [groups[name] for name in (bits.SCALES, bits.QUATS) if name in groups]
+    shared += [groups[bits.HARMONICS][:, colour:9:3] for colour in range(3 if layout.sh_degree else 0)]
     keys = np.empty((len(shared) + 1, len(fine)), np.uint64)
     keys[-1] = ids.view("<u8")[:, 0]
 
     def judge(start: int, stop: int) -> None:
         for key, words in zip(keys, shared, strict=False):
-            key[start:stop] = row_hashes(words[start:stop] & ~LOW)
+            key[start:stop] = row_hashes(words[start:stop] & ~bits.LOW)
         good, short = fine[start:stop], np.zeros(stop - start, np.int64)
         for name, every in groups.items():
             words = every[start:stop]
-            large = exponents(words)
+            large = bits.exponents(words)
             good &= ((large > 0) & (large < 254) & ~among(words, common[name])).all(axis=1)
-            short += (words & LOW == 0).sum(axis=1)
-            if name in (SCALES, HARMONICS):
-                high = ((words & _MAGNITUDE) >> np.uint32(DEEPEST + 1)).astype(np.int32)
+            short += (words & bits.LOW == 0).sum(axis=1)
+            if name in (bits.SCALES, bits.HARMONICS):
+                high = ((words & _MAGNITUDE) >> np.uint32(bits.DEEPEST + 1)).astype(np.int32)
                 threes = high.reshape(len(words), words.shape[1] // 3, 3)
                 good &= (np.abs(threes - threes[:, :, [1, 2, 0]]) > 1).all(axis=(1, 2))
-            elif name == QUATS:
-                good &= np.abs(coarse_lengths(words) - 1) > UNIT_TOLERANCE
-            elif name == OPACITIES:
+            elif name == bits.QUATS:
+                good &= np.abs(bits.coarse_lengths(words) - 1) > bits.UNIT_TOLERANCE
+            elif name == bits.OPACITIES:
                 saturated = (words >= _SATURATED[0]) & (words < _SATURATED[1])
-                good &= ~(saturated | (words | LOW == _PRUNED))[:, 0]
+                good &= ~(saturated | (words | bits.LOW == _PRUNED))[:, 0]
         good &= short < _SHORT
 
-    in_blocks(judge, len(fine), BLOCK)
+    in_blocks(judge, len(fine), bits.BLOCK)
     unique: Flags = ~np.logical_or.reduce(in_blocks(lambda index, _: repeated(keys[index]), len(keys), 1))
     return fine & unique
 
 
-def _without_small_even(gaussians: Gaussians, layout: Layout, counted: Flags) -> Flags:
+def _without_small_even(gaussians: Gaussians, layout: bits.Layout, counted: Flags) -> Flags:
     """Mask [N] of Gaussians without small even numbers, by the trailing zeros of those `counted` [N]."""
     groups, fine = layout.groups(gaussians), np.ones(len(gaussians), bool)
 
@@ -237,15 +216,15 @@ def _without_small_even(gaussians: Gaussians, layout: Layout, counted: Flags) ->
         mask = counted[start:stop]
         return np.stack([count_trailing_zeros(words[start:stop][mask]) for words in groups.values()])
 
-    counts = np.sum(in_blocks(count, len(fine), BLOCK), axis=0)
-    least = [least_exponent(histogram, MAX_SEPARATION / len(ATTRIBUTES)) for histogram in counts]
+    counts = np.sum(in_blocks(count, len(fine), bits.BLOCK), axis=0)
+    least = [least_exponent(histogram, MAX_SEPARATION / len(bits.ATTRIBUTES)) for histogram in counts]
 
     def compare(start: int, stop: int) -> None:
         for words, bound in zip(groups.values(), least, strict=True):
             block = words[start:stop]
-            fine[start:stop] &= ~((exponents(block) < bound) & (block & 1 == 0)).any(axis=1)
+            fine[start:stop] &= ~((bits.exponents(block) < bound) & (block & 1 == 0)).any(axis=1)
 
-    in_blocks(compare, len(fine), BLOCK)
+    in_blocks(compare, len(fine), bits.BLOCK)
     return fine
 
 

@@ -214,7 +214,7 @@ class CarryMethod:
             fits=tuple(fits),
             training=training,
             plan=plan,
-            grows=capacity.channel.grows,
+            grows=capacity.payloads.grows,
             survives=capacity.channel.survives,
             capacity=capacity,
         )

@@ -8,6 +8,7 @@ paper's; the baselines of `keyss.lab.baselines` override parts of it.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from statistics import fmean
@@ -16,16 +17,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from keyss.core.gaussians import Gaussians
-from keyss.core.scene import Camera, Scene
+from keyss.core.gaussians import SH_C0, Gaussians
+from keyss.core.scene import Camera
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, CombinedStrategy, Rendered
 from keyss.fitting.image_metrics import psnr, subsample_views
 from keyss.fitting.loop import Shuffle, TrainingRun, own_randomness, train
 from keyss.fitting.losses import Target, Targets, photometric_loss
 from keyss.fitting.parameters import (
+    MIN_POINTS,
     initial_gaussians,
-    initial_points,
     make_optimizers,
     to_gaussians,
     to_parameters,
@@ -40,6 +41,9 @@ from keyss.rendering import render, render_with_meta
 
 CACHE_BYTES = 2 << 30
 LAST_NETWORK_RATE = 0.05  # final factor on the decoder's rate
+FAINT = 0.006  # opacity, just visible, of points in scenes that are not theirs
+PRETRAINING_RATE = 3e-3  # of Adam, at first
+PRETRAINING_POINTS, WRONG_KEYS = 256, 4  # of a step of the pretraining
 Pose = tuple[int, int]  # a scene and the index of its training view
 
 
@@ -57,14 +61,27 @@ class Picture:
     indices: Tensor | None = None  # Gaussians that were rendered; None: all
 
 
-def combined_points(
-    scenes: Sequence[Scene], limit: int, fit: FitConfig, generator: torch.Generator
-) -> Gaussians:
-    """Gaussians at up to `limit` points of all scenes, in equal shares if there are enough points.
+def starting_points(placed: PlacedScene) -> tuple[Tensor, Tensor]:
+    """Points [P, 3] and colours [P, 3] uint8 of a scene, or of its plain model if it has none (ours).
 
-    They are as wide as the distance to their neighbours in the combined cloud.
+    The random points from which plain 3DGS then starts are the same in all scenes: a decoder cannot tell
+    them apart, and they end transparent in every scene.
     """
-    clouds = [initial_points(scene, fit.max_gaussians, generator) for scene in scenes]
+    if len(placed.scene.points) >= MIN_POINTS:
+        return placed.scene.points, placed.scene.colors
+    colors = (SH_C0 * placed.plain.sh[:, 0] + 0.5).clamp(0, 1)
+    return placed.plain.means, (255 * colors).to(torch.uint8)
+
+
+def combined_points(
+    scenes: Sequence[PlacedScene], limit: int, fit: FitConfig, generator: torch.Generator
+) -> tuple[Gaussians, Tensor]:
+    """Gaussians at up to `limit` points of all scenes, and [N] the scene of each.
+
+    Scenes have equal shares if they have enough points. Gaussians are as wide as the distance to their
+    neighbours in the combined cloud.
+    """
+    clouds = [starting_points(placed) for placed in scenes]
     counts = divide([len(points) for points, _ in clouds], limit)
     chosen = [
         torch.randperm(len(points), generator=generator)[:count].sort().values
@@ -73,7 +90,8 @@ def combined_points(
     points, colors = (
         torch.cat([cloud[part][rows] for cloud, rows in zip(clouds, chosen, strict=True)]) for part in (0, 1)
     )
-    return initial_gaussians(points, colors, fit.sh_degree, len(points), generator)
+    model = initial_gaussians(points, colors, fit.sh_degree, len(points), generator)
+    return model, torch.arange(len(scenes)).repeat_interleave(torch.tensor(counts))
 
 
 class CombinedPoses:
@@ -143,7 +161,9 @@ class KeyssTraining(TrainingRun):
         self.extent = scenes[0].scene.extent
         cameras = [view.camera for placed in scenes for view in placed.scene.train]
         self.schedule = Schedule(self.fit, cameras, self.extent)
-        start = self.start()
+        chosen = [scenes[index] for index in scene_indices(design.points, count)]
+        limit = max(1, int(design.start_share * self.fit.max_gaussians))
+        start, self.scene_of_point = combined_points(chosen, limit, self.fit, self.generator)
         self.started = len(start)
         self.parameters = to_parameters(start, device)
         self.optimizers = make_optimizers(self.parameters, self.fit, self.extent)
@@ -158,17 +178,41 @@ class KeyssTraining(TrainingRun):
         self.strategy = strategy(self.fit, self.opacity_for_pruning, freeze=released)
         self.density = self.strategy.initialize_state(self.extent)
 
-    def start(self) -> Gaussians:
-        """G_cover at the first step: the combined SfM points (section 3.4)."""
-        chosen = [self.scenes[i].scene for i in scene_indices(self.design.points, len(self.scenes))]
-        limit = max(1, int(self.design.start_share * self.fit.max_gaussians))
-        return combined_points(chosen, limit, self.fit, self.generator)
-
     def prepare(self, start: Gaussians) -> None:
         """Add what trains beside `start`: one decoder for all secrets. Random numbers are the run's own."""
         shape = replace(self.design.decoder, sh_degree=self.fit.sh_degree, key_size=len(self.keys[0]))
         self.decoder = Decoder(shape)
         self.networks.append(self.decoder)
+        if self.design.pretraining and self.design.points == "both" and "op" in shape.mask:
+            self.pretrain(start)
+
+    def pretrain(self, start: Gaussians) -> None:
+        """Train the decoder alone, without renders, to show each scene the points of its own only.
+
+        In the cover, the points of secrets start nearly transparent. A right key makes those of its secret as
+        opaque as the cover's and all others transparent; a wrong key changes nothing.
+        """
+        opaque, faint = float(start.opacity_logits[0]), math.log(FAINT / (1 - FAINT))
+        start.opacity_logits[self.scene_of_point > 0] = faint
+        with torch.no_grad():
+            self.parameters["opacities"].copy_(start.opacity_logits)
+        optimizer = torch.optim.Adam(self.decoder.parameters())
+        for step in range(self.design.pretraining):
+            rows = torch.randint(len(start), (PRETRAINING_POINTS,), generator=self.generator)
+            points, scene_of_point = start[rows], self.scene_of_point[rows]
+            keys: list[tuple[Tensor, Tensor]] = [
+                (key.cpu(), torch.where(scene_of_point == secret, opaque, faint))
+                for secret, key in enumerate(self.keys, 1)
+            ]
+            wrong = [self.wrong_key() for _ in range(WRONG_KEYS)]
+            keys += [(key.cpu(), points.opacity_logits) for key in wrong if key is not None]
+            loss = torch.stack(
+                [(self.decoder(points, key).opacity_logits - target).square().mean() for key, target in keys]
+            ).sum()
+            optimizer.param_groups[0]["lr"] = PRETRAINING_RATE * (1 - step / self.design.pretraining)
+            loss.backward()
+            optimizer.step()
+            optimizer.zero_grad()
 
     def step(self) -> None:
         self.iteration += 1
