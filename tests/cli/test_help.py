@@ -86,12 +86,14 @@ def test_misspelt_command(keyss: Run, arguments: tuple[str, ...], expected: str)
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (("reveal", "a", "--keyfile", "k", "-o", "b"), "--key-file FILE"),
-        (("hide", "--preset", "quik"), "Expected one of ('quick', 'default', 'full')"),
-        (("hide", "--format", "splat"), "'compressed-ply'"),
+        (("reveal", "a", "--keyfile", "k", "-o", "b"), "has no option --keyfile: did you mean --key-file?"),
+        (("hide", "--covr", "a"), "did you mean --cover?"),  # although required options are missing
+        (("hide", "--cover", "a", "--seckret=b", "-o", "c"), "did you mean --secret?"),
+        (("hide", "--cover", "a", "--min_psnrr", "-o", "c"), "did you mean --min-psnr?"),
+        (("hide", "--preset", "quik"), "--preset: expected one of quick, default, full, got 'quik'"),
+        (("hide", "--format", "splat"), "expected one of ply, spz, sog, compressed-ply, got"),
+        (("hide", "--fine-tune", "no"), "expected one of auto, always, never"),
     ],
 )
 def test_misspelt_option(keyss: Run, arguments: tuple[str, ...], expected: str) -> None:
-    result = keyss(*arguments)
-    assert result.status == 2
-    assert expected in result.err
+    assert_refused(keyss(*arguments), 2, expected)

@@ -16,7 +16,9 @@ import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import is_dataclass
-from typing import Any, get_type_hints
+from itertools import pairwise
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from keyss import __version__
 from keyss.core.errors import (
@@ -27,6 +29,7 @@ from keyss.core.errors import (
     OutputError,
     UsageError,
     did_you_mean,
+    nearest,
     signal_of,
 )
 
@@ -123,7 +126,28 @@ def _run(arguments: list[str], options: dict[str, Any]) -> None:
         )
     target = parse_target(name, rest)
     options.update(options_of(target))
+    _check_spelling(name, rest, options)
     tyro.cli(target, prog=f"keyss {name}", args=rest, config=(tyro.conf.FlagCreatePairsOff,))
+
+
+def _check_spelling(command: str, words: list[str], options: dict[str, Any]) -> None:
+    """Raise UsageError with a suggestion for misspelt options and values; tyro names missing ones first."""
+    known = {f"--{option.replace('_', '-')}": _choices(hint) for option, hint in options.items()}
+    for given, value in pairwise([*words, ""]):
+        flag = given.partition("=")[0].replace("_", "-")
+        if (choices := known.get(flag)) and given == flag and value not in choices:
+            raise UsageError(f"{flag}: expected one of {', '.join(choices)}, got {value!r}")
+        if flag.startswith("--") and flag not in known and (near := nearest(flag, known)):
+            raise UsageError(f"`keyss {command}` has no option {flag}: did you mean {near}?")
+
+
+def _choices(hint: Any) -> list[str]:
+    """The values of an option that has a few; empty for any other."""
+    if get_origin(hint) is Literal:
+        return [str(value) for value in get_args(hint)]
+    if get_origin(hint) in (Annotated, Union, UnionType):
+        return [value for part in get_args(hint) for value in _choices(part)]
+    return []
 
 
 def _print_completion(arguments: list[str]) -> None:
