@@ -178,7 +178,8 @@ class Wait:
 
     def __str__(self) -> str:
         left = self.left
-        ending = f"about {about(left)} left" if left >= 1 else "longer than estimated" * (left < -1)
+        overdue = left < -1 and self.seconds >= _LOG_SECONDS  # shorter estimates are never displayed
+        ending = f"about {about(left)} left" if left >= 1 else "longer than estimated" * overdue
         return f"{self.what}: {_joined(clock(self.timer() - self.start), ending)}"
 
     def __rich__(self) -> Text:

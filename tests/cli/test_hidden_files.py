@@ -90,8 +90,9 @@ def test_invalid_combinations(keyss: Run, workspace: Path, tmp_path: Path) -> No
     photos = f"hide --cover {workspace}/a --secret-file empty --key-file key0 -o {tmp_path}/out"
     for status, words, command in (
         (2, "scenes or files, not both", f"{hide} --secret cover.ply"),
-        (2, "--min-psnr is for hidden scenes", f"{hide} --min-psnr 60"),
-        (2, "--seed is for hidden scenes", f"{hide} --seed 0"),
+        (2, "--secret-file does not use --min-psnr", f"{hide} --min-psnr 60"),
+        (2, "--secret-file does not use --seed", f"{hide} --seed 0"),
+        (2, "--secret-file does not use --fine-tune", f"{hide} --fine-tune never"),
         (4, "--secret-file hides any file", letter),
         (2, "needs a model as the cover", photos),
         (2, "3,000 bytes, 'letter.pdf'", f"{reveal}/s.ply"),

@@ -55,6 +55,14 @@ def _carry(folder: Path, *more: object) -> list[object]:
     return ["hide", "--method", "carry", *files, "--width", 48, "-o", folder / "run", *more]
 
 
+@pytest.mark.parametrize("dry_run", [(), ("--dry-run",)])
+def test_training_options_without_effect(keyss: Run, models: Path, dry_run: tuple[str, ...]) -> None:
+    result = keyss(*_carry(models, "--preset", "quick", "--iterations", 7, "--seed", 1, *dry_run))
+    assert result.status == 0
+    assert "warning: --preset and --iterations: no effect, as nothing is trained" in result.err
+    assert "no effect" not in keyss(*_carry(models, "--seed", 1, "--overwrite", *dry_run)).err
+
+
 def test_empty_secret_is_not_published(keyss: Run, models: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Even if empty renders would exceed --min-psnr."""
     from keyss.methods import CarriedSecret

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, make_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass, replace
 from pathlib import Path
 from types import FunctionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin, get_type_hints
@@ -35,6 +35,11 @@ if TYPE_CHECKING:
     from keyss import HideResult, Secret, SecretFile
     from keyss.methods.method import CommandLineOption, MethodOptions
 
+_FOR_FILES = (
+    *("cover", "secret_file", "key_file", "publish", "format", "channel", "method"),
+    *("out", "overwrite", "device", "dry_run"),
+)
+_FOR_TRAINING = ("preset", "iterations", "max_gaussians")
 _HOW_TO_PUBLISH = {False: "publish this file unchanged", True: "publish this file; it may be converted"}
 
 
@@ -135,8 +140,12 @@ def hide(args: HideArguments) -> None:
             raise UsageError("--secret and --secret-file do not go together: hide scenes or files, not both")
     elif not args.secret:
         raise UsageError("no secret: give --secret SCENE or --secret-file FILE, one for each secret")
+    given = _given(args)
+    if args.secret_file and (unused := [name for name in given if name not in _FOR_FILES]):
+        raise UsageError(f"--secret-file does not use --{unused[0].replace('_', '-')}: leave it out")
     run = verb("hide")
     from keyss import progress
+    from keyss.rendering.orbit import is_model
 
     result = run(
         args.cover,
@@ -153,7 +162,26 @@ def hide(args: HideArguments) -> None:
         dry_run=args.dry_run,
         reporter=progress.reporter(),
     )
+    if result.plan or result.metrics:
+        trained = any(result.cost.steps) if result.cost else result.metrics and result.metrics.iterations
+        idle = [f"--{name.replace('_', '-')}" for name in _FOR_TRAINING if name in given]
+        if idle and not trained and all(map(is_model, (args.cover_model or args.cover, *args.secret))):
+            progress.reporter().note(
+                f"keyss: warning: {' and '.join(idle)}: no effect, as nothing is trained"
+            )
     _print_result(args, result)
+
+
+def _given(options: Any) -> list[str]:
+    """Names of the options, also of those in groups, that differ from their defaults."""
+    names = []
+    for option in fields(options):
+        value = getattr(options, option.name)
+        if is_dataclass(value):
+            names += _given(value)
+        elif value != option.default:
+            names.append(option.name)
+    return names
 
 
 def _print_result(args: HideArguments, result: HideResult) -> None:

@@ -98,7 +98,7 @@ def _folder_info(path: Path, capacity: bool) -> RunInfo | InterruptedRun | Model
     from keyss.runs.run_records import FitMetrics, HideMetrics
 
     manifest = read_manifest(path)
-    if (running := manifest.running) is not None:
+    if (running := manifest.running) is not None and running.stage != "audit":  # an audit leaves the run
         state = "interrupted: the same command with --resume continues it, --overwrite drops it"
         return InterruptedRun(f"unfinished {running.stage}", str(path), state)
     if inside := model_in(path):

@@ -147,7 +147,8 @@ class RunFolder:
         """Raise OutputError unless `running` has the stage and the arguments of this run."""
         if running.stage != self.stage:
             raise OutputError(
-                f"{self.path} holds an interrupted run of another kind ({running.stage}, not {self.stage})"
+                f"{self.path} holds an interrupted run of another kind ({running.stage}, not {self.stage}): "
+                "finish that one, or start anew with `overwrite=True`"
             )
         if running.arguments != self.arguments:
             changes = _differences(running.arguments, self.arguments)
