@@ -110,7 +110,7 @@ def _folder_info(path: Path, capacity: bool) -> RunInfo | InterruptedRun | Model
         if inside == path / MODEL:
             return RunInfo("plain model", str(path), read_record(path / METRICS, FitMetrics))
         return RunInfo("hiding", str(path), read_record(path / METRICS, HideMetrics))
-    if runs := sorted(folder for folder in path.iterdir() if is_run(folder)):
+    if runs := sorted(folder for folder in (*path.iterdir(), *path.glob("trials/*/run")) if is_run(folder)):
         raise InputError(f"{path}: expected a run, found a folder of runs; give one, such as {runs[0]}")
     if is_run(path.absolute().parent):
         raise InputError(f"{path}: expected a run, found a folder in one; give {path.parent}")
