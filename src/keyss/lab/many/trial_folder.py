@@ -15,7 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from keyss.core import BackendError, Interrupted, KeyssError, OutputError, UsageError, import_extra
+from keyss.core import BackendError, KeyssError, OutputError, UsageError, import_extra
 from keyss.files import lock, write_bytes
 from keyss.fitting import FitConfig
 from keyss.keys import generate_key
@@ -177,7 +177,7 @@ def _in_process(trials: Mapping[Path, Trial], reporter: Reporter) -> Iterator[Ou
     for folder, trial in trials.items():
         try:
             ended[folder] = _attempt(trial, folder, reporter, *_needed(trial, folder, ended))
-        except Interrupted as error:  # its message says how to resume a single run
+        except KeyboardInterrupt as error:  # that of a training says how to resume a single run
             reporter.note("interrupted: the same command resumes")
             raise KeyboardInterrupt(*error.args) from error
         yield ended[folder]
