@@ -111,6 +111,11 @@ class Training:
 PHOTOS, TRAINING = Photos(), Training()
 
 
+def flag(name: str) -> str:
+    """`--max-gaussians` for `max_gaussians`."""
+    return f"--{name.replace('_', '-')}"
+
+
 def check_exists(*paths: Path | None, keys: Sequence[Path] = ()) -> None:
     """Raise InputError if an input does not exist, UsageError if - is given twice. Does not import torch."""
     names = [str(path) for path in (*paths, *keys) if path is not None]

@@ -132,13 +132,15 @@ def _run(arguments: list[str], options: dict[str, Any]) -> None:
 
 def _check_spelling(command: str, words: list[str], options: dict[str, Any]) -> None:
     """Raise UsageError with a suggestion for misspelt options and values; tyro names missing ones first."""
-    known = {f"--{option.replace('_', '-')}": _choices(hint) for option, hint in options.items()}
-    for given, value in pairwise([*words, ""]):
-        flag = given.partition("=")[0].replace("_", "-")
-        if (choices := known.get(flag)) and given == flag and value not in choices:
-            raise UsageError(f"{flag}: expected one of {', '.join(choices)}, got {value!r}")
-        if flag.startswith("--") and flag not in known and (near := nearest(flag, known)):
-            raise UsageError(f"`keyss {command}` has no option {flag}: did you mean {near}?")
+    from keyss.cli.arguments import flag
+
+    known = {"--help": [], **{flag(option): _choices(hint) for option, hint in options.items()}}
+    for word, value in pairwise([*words, ""]):
+        given = word.partition("=")[0].replace("_", "-")
+        if (choices := known.get(given)) and given == word and value not in choices:
+            raise UsageError(f"{given}: expected one of {', '.join(choices)}, got {value!r}")
+        if given.startswith("--") and given not in known and (near := nearest(given, known)):
+            raise UsageError(f"`keyss {command}` has no option {given}: did you mean {near}?")
 
 
 def _choices(hint: Any) -> list[str]:

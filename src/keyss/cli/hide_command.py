@@ -24,6 +24,7 @@ from keyss.cli.arguments import (
     Resume,
     Training,
     check_exists,
+    flag,
     optional,
     switch,
     verb,
@@ -142,7 +143,7 @@ def hide(args: HideArguments) -> None:
         raise UsageError("no secret: give --secret SCENE or --secret-file FILE, one for each secret")
     given = _given(args)
     if args.secret_file and (unused := [name for name in given if name not in _FOR_FILES]):
-        raise UsageError(f"--secret-file does not use --{unused[0].replace('_', '-')}: leave it out")
+        raise UsageError(f"--secret-file does not use {flag(unused[0])}: leave it out")
     run = verb("hide")
     from keyss import progress
     from keyss.rendering.orbit import is_model
@@ -162,13 +163,11 @@ def hide(args: HideArguments) -> None:
         dry_run=args.dry_run,
         reporter=progress.reporter(),
     )
-    if result.plan or result.metrics:
-        trained = any(result.cost.steps) if result.cost else result.metrics and result.metrics.iterations
-        idle = [f"--{name.replace('_', '-')}" for name in _FOR_TRAINING if name in given]
-        if idle and not trained and all(map(is_model, (args.cover_model or args.cover, *args.secret))):
-            progress.reporter().note(
-                f"keyss: warning: {' and '.join(idle)}: no effect, as nothing is trained"
-            )
+    trained = any(result.cost.steps) if result.cost else result.metrics and result.metrics.iterations
+    idle = " and ".join(flag(name) for name in _FOR_TRAINING if name in given)
+    sources = args.cover_model or args.cover, *(args.secret_model or args.secret)
+    if idle and not trained and all(map(is_model, sources)):
+        progress.reporter().note(f"keyss: warning: {idle}: no effect, as nothing is trained")
     _print_result(args, result)
 
 
@@ -282,10 +281,7 @@ def with_options_of_method(arguments: Sequence[str]) -> Callable[..., None]:
     chooser.add_argument("--method", nargs="?")
     asked = chooser.parse_known_args(arguments)[0].method
     name = asked if asked in registry.METHODS else registry.DEFAULT
-    flags = {
-        method: {f"--{option.replace('_', '-')}" for option in own_options(method)}
-        for method in registry.METHODS
-    }
+    flags = {method: set(map(flag, own_options(method))) for method in registry.METHODS}
     for argument in arguments:
         given = argument.partition("=")[0].replace("_", "-")
         having = [method for method in flags if given in flags[method]]

@@ -18,7 +18,6 @@ from keyss.fitting.adam import RowAdam
 from keyss.fitting.config import FitConfig
 
 INITIAL_OPACITY = 0.1
-MIN_POINTS = 100  # scenes with fewer points start from others
 # Names of parameters, in the order of the fields of `Gaussians`.
 _NAMES = ("means", "quats", "scales", "opacities", "sh")
 
@@ -79,14 +78,19 @@ def initial_gaussians(
     )
 
 
-def initial_points(scene: Scene, limit: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Points [P, 3] and colours [P, 3] uint8 to start from: the scene's own, or random ones.
+def initial_points(
+    scene: Scene, limit: int, generator: torch.Generator, model: Gaussians | None = None
+) -> tuple[Tensor, Tensor]:
+    """Points [P, 3] and colours [P, 3] uint8 to start from: the scene's own, a model's, or random ones.
 
-    A scene with fewer than MIN_POINTS (NeRF-synthetic has none) gets grey ones, sampled uniformly from a cube
-    around the focus of the cameras, whose edge is their mean distance from it.
+    A scene with fewer than 100 points (NeRF-synthetic has none) gets those of its plain `model`. Without one,
+    it gets grey ones, sampled uniformly from a cube around the focus of the cameras, whose edge is their mean
+    distance from it.
     """
-    if len(scene.points) >= MIN_POINTS:
+    if len(scene.points) >= 100:
         return scene.points, scene.colors
+    if model is not None:
+        return model.means, (255 * (SH_C0 * model.sh[:, 0] + 0.5).clamp(0, 1)).to(torch.uint8)
     cameras = [view.camera for view in scene.train]
     focus = focus_point(cameras)
     distance = camera_positions(cameras).double().sub(focus).norm(dim=1).mean()

@@ -238,6 +238,7 @@ def test_invalid_options() -> None:
     ):
         with pytest.raises(UsageError, match=message):
             KeyssOptions(**wrong)  # type: ignore[arg-type]
-    for change in ({"beta_secret": 0.0}, {"decoder_rate": 0.0}, {"common_poses": 1.5}, {"start_share": 1.0}):
+    shares = {"common_poses": 1.5}, {"start_share": 1.0}
+    for change in ({"beta_secret": 0.0}, {"decoder_rate": 0.0}, {"pretraining": -1}, *shares):
         with pytest.raises(UsageError, match=next(iter(change))):
             replace(DESIGNS["published"], **change)

@@ -99,6 +99,8 @@ class Design:
         for name in ("common_poses", "beta_incorrect", "warm_up"):
             if not 0 <= getattr(self, name) <= 1:
                 raise UsageError(f"`{name}`: expected 0 to 1, got {getattr(self, name)}")
+        if self.pretraining < 0:
+            raise UsageError(f"`pretraining`: expected at least 0 steps, got {self.pretraining}")
         if not 0 < self.start_share < 1:
             raise UsageError(f"`start_share`: expected above 0 and below 1, got {self.start_share}")
 

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from keyss.core.gaussians import SH_C0, Gaussians
+from keyss.core.gaussians import Gaussians
 from keyss.core.scene import Camera
 from keyss.fitting.config import FitConfig
 from keyss.fitting.density import CappedStrategy, CombinedStrategy, Rendered
@@ -25,8 +25,8 @@ from keyss.fitting.image_metrics import psnr, subsample_views
 from keyss.fitting.loop import Shuffle, TrainingRun, own_randomness, train
 from keyss.fitting.losses import Target, Targets, photometric_loss
 from keyss.fitting.parameters import (
-    MIN_POINTS,
     initial_gaussians,
+    initial_points,
     make_optimizers,
     to_gaussians,
     to_parameters,
@@ -61,27 +61,16 @@ class Picture:
     indices: Tensor | None = None  # Gaussians that were rendered; None: all
 
 
-def starting_points(placed: PlacedScene) -> tuple[Tensor, Tensor]:
-    """Points [P, 3] and colours [P, 3] uint8 of a scene, or of its plain model if it has none (ours).
-
-    The random points from which plain 3DGS then starts are the same in all scenes: a decoder cannot tell
-    them apart, and they end transparent in every scene.
-    """
-    if len(placed.scene.points) >= MIN_POINTS:
-        return placed.scene.points, placed.scene.colors
-    colors = (SH_C0 * placed.plain.sh[:, 0] + 0.5).clamp(0, 1)
-    return placed.plain.means, (255 * colors).to(torch.uint8)
-
-
 def combined_points(
     scenes: Sequence[PlacedScene], limit: int, fit: FitConfig, generator: torch.Generator
 ) -> tuple[Gaussians, Tensor]:
     """Gaussians at up to `limit` points of all scenes, and [N] the scene of each.
 
-    Scenes have equal shares if they have enough points. Gaussians are as wide as the distance to their
-    neighbours in the combined cloud.
+    Scenes have equal shares if they have enough points, and those of their plain models if they have none
+    (ours): random points are alike in all scenes, so a decoder cannot tell them apart. Gaussians are as wide
+    as the distance to their neighbours in the combined cloud.
     """
-    clouds = [starting_points(placed) for placed in scenes]
+    clouds = [initial_points(placed.scene, fit.max_gaussians, generator, placed.plain) for placed in scenes]
     counts = divide([len(points) for points, _ in clouds], limit)
     chosen = [
         torch.randperm(len(points), generator=generator)[:count].sort().values
@@ -199,16 +188,12 @@ class KeyssTraining(TrainingRun):
         optimizer = torch.optim.Adam(self.decoder.parameters())
         for step in range(self.design.pretraining):
             rows = torch.randint(len(start), (PRETRAINING_POINTS,), generator=self.generator)
-            points, scene_of_point = start[rows], self.scene_of_point[rows]
-            keys: list[tuple[Tensor, Tensor]] = [
-                (key.cpu(), torch.where(scene_of_point == secret, opaque, faint))
-                for secret, key in enumerate(self.keys, 1)
-            ]
+            points, scene = start[rows], self.scene_of_point[rows]
+            targets = [(key, torch.where(scene == i, opaque, faint)) for i, key in enumerate(self.keys, 1)]
             wrong = [self.wrong_key() for _ in range(WRONG_KEYS)]
-            keys += [(key.cpu(), points.opacity_logits) for key in wrong if key is not None]
-            loss = torch.stack(
-                [(self.decoder(points, key).opacity_logits - target).square().mean() for key, target in keys]
-            ).sum()
+            targets += [(key, points.opacity_logits) for key in wrong if key is not None]
+            errors = [self.decoder(points, key.cpu()).opacity_logits - target for key, target in targets]
+            loss = torch.stack([error.square().mean() for error in errors]).sum()
             optimizer.param_groups[0]["lr"] = PRETRAINING_RATE * (1 - step / self.design.pretraining)
             loss.backward()
             optimizer.step()
